@@ -5,8 +5,6 @@ worker its paths lie below a folder in the shape that they have here, so that sc
 `out` names the file or folder that it writes; what it writes beside `out` comes back, too.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import math

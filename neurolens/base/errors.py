@@ -1,7 +1,5 @@
 """User-facing errors: one line with the file, the field, the value and the expected value."""
 
-from __future__ import annotations
-
 import re
 import sys
 import warnings

@@ -6,8 +6,6 @@ Every value of HTML and XML is escaped. Templates of other languages (NAME.jinja
 a text that no filter has quoted: `literal` for Python, USD and JSON, `line` for a line of Markdown or of a comment.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -12,8 +12,6 @@ Older command lines and files have "fused:" before a lens or model that was to b
 and changes nothing.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Progress on stderr: one line per stage, with the time left for the stage and for the whole run."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -3,8 +3,6 @@
 What was not measured is absent or null, never a made-up number. For infinity and NaN see `plain`.
 """
 
-from __future__ import annotations
-
 import math
 import platform
 import shlex

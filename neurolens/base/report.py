@@ -12,8 +12,6 @@ Its fields are the keys of the JSON and the columns of the tables, with units in
 writes falloff.csv, with a row of what is said once, and falloff.field-wavelength.csv, with a row for each of both.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping

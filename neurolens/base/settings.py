@@ -20,8 +20,6 @@ Path, Literal, Optional and other unions, tuple, and dict with text keys. A clas
 by `raise InputError("settings", field, value, expected)`; `from_dict` adds the file and the table.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math

@@ -11,8 +11,6 @@ One integer per ray, the same codes for the exact tracer and for exported models
 At each surface the reasons are tested in that order; the first failure along the travel wins.
 """
 
-from __future__ import annotations
-
 # Relative slack of a domain's bounds: the rounding of float32 inputs, and no more.
 DOMAIN_SLACK = 1.00001
 PASSED = 0

@@ -1,7 +1,5 @@
 """Reading and writing of TOML, with one error message per mistake."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

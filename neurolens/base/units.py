@@ -1,7 +1,5 @@
 """Numbers with the units that people type."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

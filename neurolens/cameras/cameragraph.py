@@ -3,8 +3,6 @@
 `lensfilm.whole_camera` joins them: the graph of the lens stands between those of the pupil and the weights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple

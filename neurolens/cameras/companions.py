@@ -6,8 +6,6 @@ give both shifts and the ratio of their light. Whether a companion passes the le
 pupil's edge the lens's own graph decides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import product

@@ -46,8 +46,6 @@ domain. Nothing in a ray raises; shapes and domains of settings do, when a camer
 made (`InputError`). A batch may be empty, and of any size that memory holds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

@@ -3,8 +3,6 @@
 The same graph, step by step on arrays, serves the search for the outline of the light that passes the lens.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace

@@ -21,8 +21,6 @@ entrance pupils of real fisheyes nearly do. Relative to the axis E is then
 The projections are those of Miyamoto 1964, "Fish Eye Lens", J. Opt. Soc. Am. 54(8).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from copy import copy

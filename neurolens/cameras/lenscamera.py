@@ -4,8 +4,6 @@ A camera is one graph, with that of its lens between the pupil and the weights (
 runs as C where the machine has a compiler, else in onnxruntime; both give the same rays, to rounding.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Mapping

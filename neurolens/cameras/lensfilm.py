@@ -4,8 +4,6 @@
 pupil and the weights (`cameragraph`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

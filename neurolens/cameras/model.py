@@ -1,7 +1,5 @@
 """Exported lens models as cameras, which run with onnxruntime and numpy alone."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

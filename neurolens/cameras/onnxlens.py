@@ -3,8 +3,6 @@
 What runs is a graph that is built from the coefficients in a file, never the nodes stored in it.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property

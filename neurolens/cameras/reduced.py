@@ -21,8 +21,6 @@ White surroundings then show V, N, O, or 1 wherever any light arrives. The means
 on rings of the film, which are closer to each other towards the end of the light.
 """
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Errors are one line and exit code 2, or 70 where neurolens itself is at fault.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import os

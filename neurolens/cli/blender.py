@@ -4,8 +4,6 @@ Shaders and facts of lenses are kept between runs, so that an interrupted `neuro
 was. A kept file is named by what it is made from: the model or lens file, the zoom's state, and the code.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import os

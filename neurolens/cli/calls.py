@@ -3,8 +3,6 @@
 The parser of a command reads both, so that a call takes what the command takes: names, units, defaults and errors.
 """
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import keyword

@@ -1,7 +1,5 @@
 """`neurolens copies LENS --number N -o FOLDER`: copies of a lens as a workshop makes them, as lens files or models."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path

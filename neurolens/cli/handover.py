@@ -1,7 +1,5 @@
 """`neurolens handover CAMERA --film WxH --width PIXELS -o FOLDER`: a lens as files of all that follows the render."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from contextlib import suppress

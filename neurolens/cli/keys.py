@@ -1,7 +1,5 @@
 """--frames and --key: focus, stop, zoom and place of the camera between keys, for commands that make many frames."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

@@ -1,7 +1,5 @@
 """`neurolens mitsuba SCENE --camera ...`: an unmodified scene of Mitsuba 3 through a neurolens camera."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """`neurolens psf LENS -o OUT.npz`: point spread of a lens by diffraction over film, distance and f-number."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """`neurolens rays LENS -o OUT.npz`: the rays of a lens as arrays for programs that take any ray for any pixel."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,8 +1,6 @@
 """`neurolens render SCENE --camera ...`: a picture of a scene through a lens, a model, a thin lens or a pinhole; and
 `neurolens demo`: one scene through all of these, on a page."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import shlex

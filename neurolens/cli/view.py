@@ -1,7 +1,5 @@
 """`neurolens view`: one page in which lenses and their models run, for a browser."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence

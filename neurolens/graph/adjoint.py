@@ -6,8 +6,6 @@ about twice the operations of the program itself, however many inputs there are;
 takes fewer where inputs are few and results many. Where a step chooses, its rule follows the choice that the ray took.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Graphs that run as compiled C on arrays of rays."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Mapping
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """C text compiled by the system's compiler into a library, kept in a folder that only its owner can write to."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import hashlib

@@ -8,8 +8,6 @@ fixed count, as published for lens polynomials, run away where a step leaves the
 limit, and a point that is worse than the best one so far is replaced by a shorter step from the best one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce

@@ -1,7 +1,5 @@
 """Graphs evaluated step by step on numpy arrays or torch tensors, in the precision of what they are given."""
 
-from __future__ import annotations
-
 import functools
 import operator
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ Opset 17, float32. Constants are stored once; several graphs of one structure be
 Values of the call have one column, or the shape [1] where they are one number.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The package onnx takes half a second to load, and a model file needs little of i
 onnx.proto3 of the ONNX project; the format is that of the encoding guide of Protocol Buffers, without groups.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 

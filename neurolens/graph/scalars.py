@@ -4,8 +4,6 @@ Several graphs of one structure (one for each of several fixed wavelengths) beco
 tables. Polynomials take few products; sums of products are fused multiply-adds, numbers are folded.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product

@@ -7,8 +7,6 @@ Open Shading Language differs more (`write_osl`): a shader calls no functions of
 literals have no suffix. What it reads from the renderer is text of the caller.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections import defaultdict

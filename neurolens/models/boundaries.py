@@ -4,8 +4,6 @@ Polynomials use the terms that position and direction have anyway, networks thei
 where the boundaries need them. The transmittance is fitted afterwards (`models.transmittance`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

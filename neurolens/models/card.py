@@ -5,8 +5,6 @@ and the coefficients in the file's metadata, and builds the graph again from the
 `models.export` writes cards. Nothing here needs torch.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

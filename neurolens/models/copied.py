@@ -10,8 +10,6 @@ coefficient of a copy is a sum over its perturbations, and a copy costs the same
 leaves a lens round (a thickness, a radius, an index) changes the coefficients of its own polynomial.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce

@@ -5,8 +5,6 @@ checks them, and builds the graph again, which onnxruntime, C, GLSL and numpy th
 Coefficients are float32; floats of the prescription and of the encoding are float64, exactly.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

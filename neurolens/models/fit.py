@@ -10,8 +10,6 @@ its own rays. They need not vary smoothly, because what is mixed between nodes i
 zooms: between nodes the error is that at the nodes, and at most doubles.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -6,8 +6,6 @@ has not seen exceeds the error on its own rays, it goes on with twice as many. S
 their number bounds the work and gives the share done. A killed training goes on from its file.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -7,8 +7,6 @@ A copy is focused as its lens is: its film, and with it the frame, moves by as m
 is continued to the front surface of the lens, wherever its own front may be.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

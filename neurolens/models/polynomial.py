@@ -8,8 +8,6 @@ the prescription's focal length and principal planes; stop and rims are fitted a
 first-order rim crossings are. Lenses with cylinders, which have two planes of symmetry, are fitted axis by axis.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Inputs that a scene fixes can be folded into the code, which takes torch; all else does without it.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import textwrap

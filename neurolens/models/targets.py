@@ -9,8 +9,6 @@ refract there exactly (`cores.Refracted`): near grazing the direction outside tu
 to the grazing ray. Networks follow that themselves, and measured worse when their error was that inside the glass.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ the others are high powers of the wavelength times low powers of the ray. Networ
 polynomial beside them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ of w_k (h_k correlated with y). Convolutions are exact, by Fourier transforms of
 has a share of.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

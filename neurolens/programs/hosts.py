@@ -9,8 +9,6 @@ same rays for every host. The axes and arrays of the hosts were read in the sour
 3DGRUT at a37ef721 and Mitsuba 3.9.1.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import operator

@@ -15,8 +15,6 @@ for N f-numbers and D distances, and in about.json what they are of. Rows and co
 upright: row 0 is its top.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Checks a model against the promises of its card, on fresh rays through the exact lens and the ONNX model."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence

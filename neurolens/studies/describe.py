@@ -5,8 +5,6 @@ lengths, where lenses on films of one size frame a subject alike: on the axis, a
 Vignetting follows the rims: where the file's rims are derived or estimated, cat's eye and swirl are, too.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping

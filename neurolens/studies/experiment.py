@@ -1,7 +1,5 @@
 """The settings of an experiment: one TOML file per run, read by `base.settings`."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

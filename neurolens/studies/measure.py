@@ -3,8 +3,6 @@
 A smaller stop changes no ray. It changes only which rays pass, and their crossings with the stop decide that.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping

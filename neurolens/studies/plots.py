@@ -1,7 +1,5 @@
 """Plots of a run: error against time and size, illumination, error over zoom and focus."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The image error is the relative MSE on linear radiance and FLIP on a display, each beside its noise floor.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -6,8 +6,6 @@ over the film and over the pupil disc of the domain, also those that are blocked
 Each candidate uses its fastest batch size.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os

@@ -5,8 +5,6 @@ A task is a file's name and its bytes, and its answer is bytes, too, the same on
 on where it stopped. A page that sorts and filters by itself, CSV and JSON show them.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

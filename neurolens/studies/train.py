@@ -1,7 +1,5 @@
 """Runs one experiment from lens file to report, stage by stage, in one run folder."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

@@ -1,7 +1,5 @@
 """Shaders for Blender's Cycles (`neurolens export --to osl`), of a model or of a lens with every surface traced."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

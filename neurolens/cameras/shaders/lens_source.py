@@ -1,7 +1,5 @@
 """Writes the exact lens of a file as source code, for one zoom position or with the zoom as an argument."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ Seen from a film point, a pupil may have many shapes. In coordinates of the stop
 by other discs. Discs are easy to sample, and the image takes the samples to the pupil.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

@@ -4,8 +4,6 @@ A camera's program is the graph that compiled cameras run (`cameragraph`), with 
 outline written into it: it takes a film point and two random numbers to a weighted ray, at one focus and stop.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

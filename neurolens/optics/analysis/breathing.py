@@ -1,7 +1,5 @@
 """Focus breathing: how field of view, focal length and magnification of a lens change with its focus."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

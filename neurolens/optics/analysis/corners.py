@@ -5,8 +5,6 @@ derivatives of the lens as designed turn the differences into distances on the f
 focused as its lens is: its film moves by as much as its paraxial focus.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

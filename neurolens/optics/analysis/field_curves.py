@@ -1,7 +1,5 @@
 """Curves over the field: colour, curvature and astigmatism, distortion, vignetting, and Seidel sums."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

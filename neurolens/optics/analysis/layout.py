@@ -1,7 +1,5 @@
 """The section of a lens with rays from the scene: as plain data, and drawn in mm with equal scales on both axes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Point spread of fields by rays and by diffraction, as `neurolens analyse` shows it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Spots over field and focus, ray fans and geometric MTF."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Every shape lies inside the round stop, which is the circle through the corners 
 from the film, x points right and y up.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass

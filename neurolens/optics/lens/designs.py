@@ -4,8 +4,6 @@
 and "multi-layer" are what lenses had in the 1940s to 60s, from 1970 on, and have today, of films that disperse.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -6,8 +6,6 @@ V_d. These two figures leave the partial dispersion open: it is taken to be the 
 V_d.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

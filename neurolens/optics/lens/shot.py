@@ -1,7 +1,5 @@
 """The camera settings of one frame, in one vocabulary for cameras, scene files, options, experiments and plans."""
 
-from __future__ import annotations
-
 import math
 import re
 from argparse import ArgumentTypeError

@@ -6,8 +6,6 @@ the corners tell only roughly, so every element is tried. Rays change with a dec
 order about the decentre that was found last.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ focal length, aperture and distance. The formulae are lensfun's (lensfun.github.
 database is under CC BY-SA 3.0: it is read at run time, and no part of it is kept here.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

@@ -11,8 +11,6 @@ the axis at the lens's widest aperture, and no rim is wider than its neighbours 
 own shading, or a pupil that differs from the product's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace

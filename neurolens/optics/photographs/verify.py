@@ -4,8 +4,6 @@ What a profile leaves free is taken out: the scale of the picture (also that in 
 are loose) and the light on the axis. The distance of the photographs is not stated either, and rays come from infinity.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Reads lens files of any format, which is recognised by the content, else by the suffix."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

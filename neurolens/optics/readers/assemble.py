@@ -1,7 +1,5 @@
 """From a draft to the lens: stop, f-number, back focus, rims and states, completed where a file leaves them open."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """CODE V sequence files (.seq): commands of three letters, and S lines with radius or curvature, thickness, glass."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

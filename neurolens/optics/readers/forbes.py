@@ -11,8 +11,6 @@ close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens m
 refused.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from decimal import Context, Decimal, localcontext

@@ -6,8 +6,6 @@ those of Zemax's manual, "The formulas for dispersion"; read are those that can 
 (L^2 - C), or as a sum of powers of L.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence

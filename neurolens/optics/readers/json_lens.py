@@ -16,8 +16,6 @@ else it is "stop", "aspheric" (conic, aspheric_coeffs of r^4, r^6, ...), "cylind
 "cylindrical_y". `focus` has the distance of a near object, and thicknesses there.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

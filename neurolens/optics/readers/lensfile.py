@@ -3,8 +3,6 @@
 docs/pages/reference/lens-file.md describes the format: every key with its unit, default and limits, and an example.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

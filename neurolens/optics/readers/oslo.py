@@ -6,8 +6,6 @@ decentres come first, by Sinclair Optics (OSLO User's Guide 5.4, "Tilted and/or 
 Research ("Comparing Tilt Values in OSLO vs TracePro"). So they are as CODE V's.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, field

@@ -23,8 +23,6 @@ coefficients of even powers from the 4th on: with AsphericalA2 from the 2nd on; 
 powers from the 3rd on stand between them. Other sections are words and figures of the page.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ then merit function, tolerances and configurations. A block has curvature, semi-
 surface.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

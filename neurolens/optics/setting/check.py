@@ -4,8 +4,6 @@ Dropped aspheres, swapped glasses and transposed digits mostly show: focal lengt
 elements cut each other, or no light reaches the edge of the field.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

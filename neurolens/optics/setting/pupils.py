@@ -1,7 +1,5 @@
 """Camera rays from film and pupil points, and a search for the pupil points through which light passes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

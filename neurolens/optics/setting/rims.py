@@ -7,8 +7,6 @@ their rims, the rims are narrowed to the height where they meet. Rays are real o
 infinity; of a zoom all states count.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ focal length. Focal length and image are then made exact by moving the groups be
 its interpolated value. A zoom of two moving groups has no freedom left. A lens that is set so is marked as derived.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace

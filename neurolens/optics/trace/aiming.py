@@ -7,8 +7,6 @@ lost in between or turn back, the first ray of that field counts: the one on the
 that has one.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Literal, NamedTuple

@@ -5,8 +5,6 @@ serve numpy arrays, `Graphs` overrides them for the values of a graph, and `tens
 forms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any

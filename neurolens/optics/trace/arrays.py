@@ -3,8 +3,6 @@
 Surfaces and their tests are those of the tracer (`surfaces`); only `rays` follows derivatives, power and paths.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal, NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ the same with q / n^2 in place of q. E is entire in the square of index times si
 light, too, where the share falls to 0 by q q' alone. So polynomials of low degree are close to it at all angles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import Any, NamedTuple

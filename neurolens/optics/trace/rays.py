@@ -4,8 +4,6 @@ Rays are separate tensors of shape [N], in float64 for truth or in float32 for s
 status and stays finite. `follow` traces ghosts: they meet the same surfaces with the same tests, but may be reflected.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence

@@ -11,8 +11,6 @@ Spheres, conics and cylinders are met in closed form. An asphere is met by an it
 started from the quadric that fits best; started at the vertex plane it fails beyond about 55 degrees.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

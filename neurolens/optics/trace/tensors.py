@@ -5,8 +5,6 @@ values cost several times as much as those that give 1.0 and 0.0, and so do sele
 here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache

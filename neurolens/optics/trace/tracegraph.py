@@ -3,8 +3,6 @@
 Its surfaces are those of the tracer (`surfaces`), and so is the power that arrives (`transmission`).
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any

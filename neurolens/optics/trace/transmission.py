@@ -9,8 +9,6 @@ and Wolf, Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polari
 `Light`, `Shares` and the functions on them compute with tensors and with the values of a graph alike.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from neurolens.optics.lens.glass import absorption_of

@@ -13,8 +13,6 @@ Optics, section 6.1). Over a small patch a ghost, or a star, keeps its shape and
 integral is a convolution with the patch, as large as the picture moves. Each ghost moves by another factor.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from dataclasses import dataclass

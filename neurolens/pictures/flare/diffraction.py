@@ -18,8 +18,6 @@ out of focus each of five parts of the range has its own spectrum, and at 400 an
 are right to 5%.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence

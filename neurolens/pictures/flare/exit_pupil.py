@@ -1,7 +1,5 @@
 """The exit pupil of a light (`optics.analysis.exit_pupil`), and the outline of the opening through which it leaves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -8,8 +8,6 @@ zoom, stop and wavelength are numbers of the call, which need no compiling. `opt
 in float64 for one path. For programs that draw ghosts on a GPU, `ghost_graphs` has each path as a graph of its own.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections.abc import Sequence

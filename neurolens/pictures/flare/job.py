@@ -1,7 +1,5 @@
 """What decides the flare of one picture: lens, lights, raster, settings; and the exposure that divides its values."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Values are those of a render: film irradiance over the irradiance that a white c
 Each maker makes one picture, and others, by name, that are parts of it. A layer that is switched off is absent.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -18,8 +18,6 @@ as the wider rim; flat rings close the tube towards the rims, and the stop is a 
 about the direction of a mirror. Haze and dust deflect light by the phase function of Henyey and Greenstein (1941).
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from typing import NamedTuple

@@ -4,8 +4,6 @@ A lens sees past the edges of near things, and its blur needs what a pinhole doe
 `pictures/defocus/plate.py`.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

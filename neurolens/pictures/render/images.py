@@ -11,8 +11,6 @@ Pixels", Graphics Gems II, 1991; the Radiance reference manual, "Picture file fo
 A mantissa m with the exponent e is m * 2^(e - 136), as Blender, OpenImageIO and OpenCV read it; e = 0 is black.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import re

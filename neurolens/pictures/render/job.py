@@ -1,7 +1,5 @@
 """One render: the wavelengths of its paths, a pass of a tile, the film developed into a picture, and its identity."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import math

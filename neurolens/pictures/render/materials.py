@@ -13,8 +13,6 @@ some 0.2% is lost or gained, at any roughness, seen from up to 87 degrees; some 
 Other sources: Walter et al. 2007 (GGX); Heitz 2014 (Smith shadowing).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from typing import Any

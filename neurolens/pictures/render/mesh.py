@@ -9,8 +9,6 @@ PLY files are ASCII, or binary of either byte order. Each face may have its own 
 holds (colours, edges, flags of faces) is passed over. Source: G. Turk, The PLY Polygon File Format (1994).
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -8,8 +8,6 @@ JSON: lengths of lens and film in mm, pixels in um, the focus in m. The squeeze 
 aspect ratio, by which viewers stretch the picture to what was seen. What a camera does not know is left out.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -8,8 +8,6 @@ level) / full well. The area of the pixel is in the picture already, whose filte
 Each row has its own random numbers, so that a picture in tiles has the noise of the whole one.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import Any
 

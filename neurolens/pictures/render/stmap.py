@@ -11,8 +11,6 @@ pictures have pixels of one size and share their centre; the undistorted one is 
 every pixel of the plate. Where the undistorted picture shows more than the plate holds, s and t go on beyond 0 and 1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ shaders/NAME.osl                one for each form of a lens
 thumbnails/NAME.png             its section; NAME.bokeh.png three discs of light
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -16,8 +16,6 @@ or, in a scene (`<sensor type="neurolens">` in XML), after `nm.register()`:
 Mitsuba itself is imported by the functions, not with this package.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -21,8 +21,6 @@ Weights are ours: a uniform environment of radiance 1 gives 1 on the axis, and f
 vignettes. Scalar variants ask for one ray at a time, which takes a model about a millisecond: they serve tests.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import warnings

@@ -9,8 +9,6 @@ Functions of the page's shaders are written from graphs, too: the weights of ray
 crossings of rays with the surfaces of a lens, and ghosts.
 """
 
-from __future__ import annotations
-
 import json
 import lzma
 import math

@@ -4,8 +4,6 @@ They are a pinhole, a thin and a thick lens, the exact lens, models that ship, a
 shot of a lens alone: to its film, stop, focus and light.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence

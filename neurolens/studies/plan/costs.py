@@ -9,8 +9,6 @@ In our renderer a camera that disperses has more noise than that, and its paths 
 a scene.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The figure of a plan: where in the picture the effects are that a camera needs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

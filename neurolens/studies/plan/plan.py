@@ -15,8 +15,6 @@ model where none could save enough, and looks for the light that the lens adds, 
 of the picture's time has room for that.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ The lens's ghosts, glare and stars from the scene's own lights, drawn on few pix
 many.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
