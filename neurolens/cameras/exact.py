@@ -114,10 +114,16 @@ class ExactCamera(LensCamera):
         plane = pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
         scene = LensScene(ExactRun(self.lens, plane, shot.wavelength_nm), float(film_z), stop_mm, self.lens.aperture)
         data = first_order(self.lens)
-        about = {"camera": "exact", "lens": tabled.identity, "efl_mm": float(data.efl_mm)}
-        about |= {"f_number": float(data.f_number), "derived": self.lens.derived, "rims": lens.rims}
-        about["coatings"] = self.lens.coatings
-        about["lens_state"] = state_of(self.lens, used, float(first_order(tabled).efl_mm))
+        about = {
+            "camera": "exact",
+            "lens": tabled.identity,
+            "efl_mm": float(data.efl_mm),
+            "f_number": float(data.f_number),
+            "derived": self.lens.derived,
+            "rims": lens.rims,
+            "coatings": self.lens.coatings,
+            "lens_state": state_of(self.lens, used, float(first_order(tabled).efl_mm)),
+        }
         self.place(self._outline(scene, plane, bounds, shot, progress), scene, shot, about, progress)
 
     @property

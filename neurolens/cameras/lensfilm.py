@@ -221,9 +221,15 @@ class LensFilm:
         axis = np.zeros_like(square) + np.array(self.pose.moved_mm, np.float32)[:, None]
         film, pupil, area = self.start(axis, square, wavelength)
         out = self.scene(film, pupil, wavelength)
-        given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
-        given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
-        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
+        given = {
+            "film_mm": film,
+            "pupil_mm": pupil,
+            "area_mm2": area[None],
+            "scene_ray": out.scene_ray,
+            "transmittance": out.transmittance[None],
+            "lens_status": out.status[None].astype(np.float32),
+            **{name: np.array([[value]], np.float32) for name, value in self.numbers.items()},
+        }
         exposure = float(evaluate(weight_graph(), given)["weight"].mean(dtype=np.float64))
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")

@@ -71,9 +71,14 @@ class PupilOutline:
                 square; 0 where nothing passes. It is the inverse of the point's probability density. Over a polygon it
                 varies little, and its mean is the polygon's area.
         """
-        given = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None], "outline": self.table}
-        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        given["lean"] = 0 * film_mm[:1] if lean is None else lean[None]
+        given = {
+            "film_mm": film_mm,
+            "square": square,
+            "wavelength_nm": wavelength_nm[None],
+            "outline": self.table,
+            **{name: np.array([[value]], np.float32) for name, value in self.numbers.items()},
+            "lean": 0 * film_mm[:1] if lean is None else lean[None],
+        }
         found = evaluate(self.graph, given)
         area = found["area_mm2"][0]
         return found["pupil_mm"], np.where(area > 0, area, np.float32(0))

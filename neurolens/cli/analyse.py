@@ -337,8 +337,10 @@ def _mtf_text(found: Mtf, over_height: bool = False) -> str:
 
 def _seidel_text(found: Seidel) -> str:
     header = ("surface", *(name.replace(" colour", "") for name in found.names))
-    rows = [(str(k), *(f"{round(v, 5) + 0.0:.5f}" for v in row)) for k, row in enumerate(found.surfaces)]
-    rows.append(("total", *(f"{round(v, 5) + 0.0:.5f}" for v in found.total)))
+    rows = [
+        *((str(k), *(f"{round(v, 5) + 0.0:.5f}" for v in row)) for k, row in enumerate(found.surfaces)),
+        ("total", *(f"{round(v, 5) + 0.0:.5f}" for v in found.total)),
+    ]
     odd = found.odd_powers
     note = f"\nNot counted: the odd powers of surface {', '.join(map(str, odd))}" if odd else ""
     head = f"Seidel sums (mm, {found.wavelength_nm:.0f} nm, image height {cli.number(found.image_height_mm)} mm)"

@@ -177,8 +177,13 @@ examples:
         own_table = self.to not in LANGUAGES or LANGUAGES[self.to].own_table
         program = camera_program(camera.film, graph, self.derivatives, own_table=own_table)
         numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
-        constants = {"film_width_mm": self.film[0], "film_height_mm": self.film[1], **numbers}
-        constants |= {"pupil_z_mm": camera.film.outline.pupil_z_mm, "exposure": camera.film.exposure}
+        constants = {
+            "film_width_mm": self.film[0],
+            "film_height_mm": self.film[1],
+            **numbers,
+            "pupil_z_mm": camera.film.outline.pupil_z_mm,
+            "exposure": camera.film.exposure,
+        }
         told = ", ".join(f"{key} {value:.6g}" for key, value in constants.items())
         comment = [
             f"{lens['name']}: a whole camera, written by neurolens {__version__} from {file.name}.",

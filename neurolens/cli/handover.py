@@ -125,9 +125,17 @@ class _Writer:
         exits, _ = read_channels(command.out / f"shot.exit{shot.frames[0].name}.exr", "RG")
         self._worse("exit_px", standards.exit_residual_px(self.frames[0].fields[""], shot.plates, exits))
         self._worse("maps_px", max(row.there_and_back_px for row in found.frames))
-        values = {"shot": shot, "about": f"{shot.about}, neurolens {__version__}", "entries": entries}
-        values |= {"left": self.left, "fits": self.fits, "notes": self.notes, "projection": command.projection}
-        values |= {"parallax": found.frames[0].parallax, "types": standards.LENSFUN_TYPES}
+        values = {
+            "shot": shot,
+            "about": f"{shot.about}, neurolens {__version__}",
+            "entries": entries,
+            "left": self.left,
+            "fits": self.fits,
+            "notes": self.notes,
+            "projection": command.projection,
+            "parallax": found.frames[0].parallax,
+            "types": standards.LENSFUN_TYPES,
+        }
         for name in ("shot.usda", "shot.nk", "shot.blender.py", "shot.lensfun.xml", "README.md"):
             if entries or name != "shot.lensfun.xml":
                 template = f"handover.{name.removeprefix('shot.')}.jinja"

@@ -411,8 +411,14 @@ def _cells(row: dict[str, Any], character: bool, count: int) -> list[str]:
     if "name" not in row:
         return [row["lens"], *["-"] * (count - 2), row["verdict"]]
     efl = cli.number(row["efl_mm"]) + ("" if row["efl_x_mm"] is None else f" / {cli.number(row['efl_x_mm'], 3)}")
-    begin = [row["lens"], one_line(row["believed_to_be"] or row["name"], 40), one_line(row["maker"] or "-", 16)]
-    begin += [str(row["year"] or "-"), efl, cli.number(row["f_number"], 3)]
+    begin = [
+        row["lens"],
+        one_line(row["believed_to_be"] or row["name"], 40),
+        one_line(row["maker"] or "-", 16),
+        str(row["year"] or "-"),
+        efl,
+        cli.number(row["f_number"], 3),
+    ]
     field = "-" if row["half_field_deg"] is None else f"{row['half_field_deg']:.4g}°"
     middle = [field, cli.number(row["image_radius_mm"]), *(str(row[key] or "-") for key in ("refractions", "states"))]
     if character:

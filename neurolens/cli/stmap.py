@@ -271,8 +271,10 @@ examples:
                         report((done + share / 2) / len(todo))
 
                     planes = make(field, plates, part)
-                    header = standard_attributes(frame.camera.settings, frame=frame.index)
-                    header["pixelAspectRatio"] = facts["pixel_aspect"]
+                    header = {
+                        **standard_attributes(frame.camera.settings, frame=frame.index),
+                        "pixelAspectRatio": facts["pixel_aspect"],
+                    }
                     write_channels(path, planes, None, facts, header)
                 files.append(str(path))
                 report((k + 1) / len(todo))
@@ -281,12 +283,18 @@ examples:
     def _facts(self, frame: TracedFrame, plates: Plates, kind: str, name: str) -> dict[str, Any]:
         """Return what the header of a map says of it."""
         field = frame.fields[name]
-        about: dict[str, Any] = {"version": __version__, "name": frame.camera.name}
-        about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
-        about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
-        about["settings"] = fingerprint_of(plain([frame.camera.settings, self.distance, self.state.stop]))
-        about |= {"map": kind, "wavelengths_nm": field.spectrum[0].tolist()}
-        return about | vars(Undistorted.of(field, plates))
+        return {
+            "version": __version__,
+            "name": frame.camera.name,
+            "picture_px": list(plates.picture),
+            "undistorted_px": list(plates.undistorted),
+            "film_mm": list(self.film),
+            "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m,
+            "settings": fingerprint_of(plain([frame.camera.settings, self.distance, self.state.stop])),
+            "map": kind,
+            "wavelengths_nm": field.spectrum[0].tolist(),
+            **vars(Undistorted.of(field, plates)),
+        }
 
     def found(self, frames: list[TracedFrame], plates: Plates, files: list[str]) -> Maps:
         """Return the figures of the maps."""

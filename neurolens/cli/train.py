@@ -183,12 +183,16 @@ class TrainedEach(Report):
 def _text(results: Mapping[str, Any], folder: Path) -> str:
     header = ("model", "rms um", "p99 um", "angle rms deg", "false pass", "false block", "ns/ray", "C ns/ray", "fit s")
     rows = [_row(model) for model in results.get("models", ())]
-    parts = [str(results.get("title") or folder.name), cli.table(header, rows)]
-    parts += [
-        f"Optical path of {m['name']}: {cli.number(m['phase_rms_waves'], 2)} waves RMS, "
-        f"{cli.number(m['phase_max_waves'], 2)} at worst"
-        for m in results.get("models", ()) if "phase_rms_waves" in m
-    ]  # fmt: skip
+    parts = [
+        str(results.get("title") or folder.name),
+        cli.table(header, rows),
+        *(
+            f"Optical path of {m['name']}: {cli.number(m['phase_rms_waves'], 2)} waves RMS, "
+            f"{cli.number(m['phase_max_waves'], 2)} at worst"
+            for m in results.get("models", ())
+            if "phase_rms_waves" in m
+        ),
+    ]
     target = results.get("target")
     if target:
         reached = "reached" if target["met"] else "no model tried reaches it, the closest is"

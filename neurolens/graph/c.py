@@ -267,9 +267,9 @@ class PartWriter(Writer):
             "size_t number",
             f"float ({pointer} waiting)[{self.macro}_ROWS]",
             *(f"const float {pointer} {i}" for i in rays),
+            *(f"float {i}" for i in numbers),
+            *(f"{'int' if o == 'status' else 'float'} {pointer} {o}" for o in made),
         ]
-        arguments += [f"float {i}" for i in numbers]
-        arguments += [f"{'int' if o == 'status' else 'float'} {pointer} {o}" for o in made]
         text = part(
             "parts.h", "part",
             name=self.name, macro=self.macro, part=number, arguments=",\n    ".join(arguments),
@@ -401,10 +401,12 @@ def write_blocks(program: Program, name: str) -> str:
     columns, weights = step.columns, len(step.arguments) - step.indices
     groups, own = weights // step.indices, program.own_tables.get(step.name)
     made = [*first.outputs, *(f"column_{c}" for c in range(columns))]
-    places = {row: f"in[{k}] + at" for k, row in enumerate(whole.per_ray)}
-    places |= {number: f"call[{k}]" for k, number in enumerate(whole.per_call)}
-    places |= {number: f"once.{number}" for number in same.outputs}
-    places |= {row: f"made[{k}]" for k, row in enumerate(made)}
+    places = {
+        **{row: f"in[{k}] + at" for k, row in enumerate(whole.per_ray)},
+        **{number: f"call[{k}]" for k, number in enumerate(whole.per_call)},
+        **{number: f"once.{number}" for number in same.outputs},
+        **{row: f"made[{k}]" for k, row in enumerate(made)},
+    }
     width = padded_columns(columns)
     cells = [
         f"const float *const cell_{k} = table + {width * groups} * "
@@ -437,8 +439,10 @@ def _block_of_rays(program: Program, name: str) -> str:
     once, rest = program.of_the_call()
     parts = ((program, ""), (once, "_once"), (rest, "_each"))
     whole, same, each = (Signature.of(p, f"{name}{part}") for p, part in parts)
-    places = {row: f"in[{k}]" for k, row in enumerate(whole.per_ray)}
-    places |= {number: f"call[{k}]" for k, number in enumerate(whole.per_call)}
+    places = {
+        **{row: f"in[{k}]" for k, row in enumerate(whole.per_ray)},
+        **{number: f"call[{k}]" for k, number in enumerate(whole.per_call)},
+    }
     known = f"const {same.name}_ray once = {same.name}({', '.join(places[n] for n in same.inputs)});"
     places |= {number: f"once.{number}" for number in same.outputs}
     given = [*(places[row] for row in each.inputs), *(f"out[{k}]" for k in range(len(each.outputs))), "status"]

@@ -33,9 +33,16 @@ FILM_X_Y, WAVELENGTH = RAY[:2], "wavelength_nm"
 FILM_Z, STOP_RADIUS = "film_z_mm", "stop_radius_mm"  # for a whole call
 SCENE_RAY = ("x_mm", "y_mm", "z_mm", "dx", "dy", "dz")
 TRANSMITTANCE, STOP, STATUS = "transmittance", ("stop_x_mm", "stop_y_mm"), "status"
-_ROWS = {"rays": (*RAY, WAVELENGTH), "film_mm": FILM_X_Y, "scene_ray": SCENE_RAY, "stop_xy_mm": STOP}
 # Of a camera: points of the unit square, and rays in metres.
-_ROWS |= {"square": ("u", "v"), "pupil_mm": RAY[2:], "ray": ("x_m", "y_m", "z_m", "dx", "dy", "dz")}
+_ROWS = {
+    "rays": (*RAY, WAVELENGTH),
+    "film_mm": FILM_X_Y,
+    "scene_ray": SCENE_RAY,
+    "stop_xy_mm": STOP,
+    "square": ("u", "v"),
+    "pupil_mm": RAY[2:],
+    "ray": ("x_m", "y_m", "z_m", "dx", "dy", "dz"),
+}
 # Of a ghost: light at the front, and light at the film.
 ENTERING, ARRIVING = ("dx", "dy", "x_mm", "y_mm", WAVELENGTH), ("film_x_mm", "film_y_mm", "power", "worst")
 _ROWS |= {"entering": ENTERING, "arriving": ARRIVING}

@@ -59,9 +59,9 @@ class _Lowering:
                 arrays = [np.stack([g.nodes[number].arrays[i] for g in graphs], -1) for i in range(len(node.arrays))]
                 self.rows.append(rule(self, node, given, arrays))
             else:
-                # a single row stands for any
-                rows = [[v[r if len(v) > 1 else 0] for v in given] for r in range(node.rows)]
-                self.rows.append([self._each(node.kind, *row) for row in rows])
+                # A single row stands for any.
+                operands = ([v[r if len(v) > 1 else 0] for v in given] for r in range(node.rows))
+                self.rows.append([self._each(node.kind, *each) for each in operands])
         for name, value in graphs[0].outputs.items():
             rows = [self._number(v) for v in self.rows[value.number]]
             self.program.outputs.update(zip(row_names(name, len(rows)), rows, strict=True))

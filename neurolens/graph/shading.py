@@ -350,8 +350,7 @@ def write_osl(
     A state's numbers are mixed in the shader, which costs nothing where the renderer knows the state when it compiles.
     """
     writer = Osl(program, name)
-    head = [p.text() for p in parameters]
-    head += [f"output {_KINDS.get(o, 'vector')} {o} = 0.0" for o in outputs]
+    head = [*(p.text() for p in parameters), *(f"output {_KINDS.get(o, 'vector')} {o} = 0.0" for o in outputs)]
     tables = ""
     for table, numbers in program.own_tables.items():
         values = ", ".join(plain(literal(v)) for v in numbers.reshape(-1))

@@ -99,8 +99,7 @@ class Axis:
         """
         factor, offset = self.pieces
         t = np.clip(factor * self._coordinate(value) + offset, -1, 1)
-        rows = [np.ones(1)]
-        rows += [np.cos(j * np.arccos(t)) - (-1) ** j for j in range(1, self.degree + 1)]
+        rows = [np.ones(1), *(np.cos(j * np.arccos(t)) - (-1) ** j for j in range(1, self.degree + 1))]
         return np.concatenate(rows)
 
     @cached_property

@@ -51,9 +51,6 @@ class Copied(Symmetric):
         leans: [G, 2, 2, M] the same for each gate, of h1 and h2.
     """
 
-    exponents: Exponents
-    ab: Array
-    scalars: Array
     bends: Array
     leans: Array
     _forms = ROUND

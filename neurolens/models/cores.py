@@ -235,6 +235,7 @@ def without_w(exponents: Exponents, w: float) -> tuple[Exponents, Array]:
     return unique, merge
 
 
+@dataclass(frozen=True, eq=False)
 class Symmetric(Core):
     """Polynomials in invariants for the scalars and for A and B of A p + B u: `ab` [3, 2, .., M], `scalars` [S, M].
 
@@ -248,7 +249,7 @@ class Symmetric(Core):
 
     def fixed(self, w: float) -> Self:
         exponents, merge = without_w(self.exponents, w)
-        return replace(self, exponents=exponents, ab=self.ab @ merge, scalars=self.scalars @ merge)  # type: ignore[type-var]
+        return replace(self, exponents=exponents, ab=self.ab @ merge, scalars=self.scalars @ merge)
 
     def plus(self, ab: Array, scalars: Array) -> Self:
         """Return the polynomial with constants added to `ab` [3, 2, ..] and to the scalars [S]."""
@@ -259,10 +260,10 @@ class Symmetric(Core):
         else:
             exponents = np.concatenate([exponents, np.zeros((1, exponents.shape[1]), np.int64)])
             both = (np.concatenate(pair, -1) for pair in zip((self.ab, self.scalars), more, strict=True))
-        return replace(self, exponents=exponents, **dict(zip(("ab", "scalars"), both, strict=True)))  # type: ignore[type-var]
+        return replace(self, exponents=exponents, **dict(zip(("ab", "scalars"), both, strict=True)))
 
     def keep(self, scalars: Sequence[int]) -> Self:
-        return replace(self, scalars=self.scalars[list(scalars)])  # type: ignore[type-var]
+        return replace(self, scalars=self.scalars[list(scalars)])
 
     @cached_property
     def coefficients(self) -> int:
@@ -335,9 +336,6 @@ class InvariantPolynomial(Symmetric):
         scalars: [S, M].
     """
 
-    exponents: Exponents
-    ab: Array
-    scalars: Array
     _forms = ROUND
 
     @cached_property
@@ -356,9 +354,6 @@ class MirrorPolynomial(Symmetric):
         scalars: [S, M].
     """
 
-    exponents: Exponents
-    ab: Array
-    scalars: Array
     basis = "mirror"
     _forms = MIRROR
 

@@ -185,8 +185,10 @@ def check_size(core: Any) -> None:
 def _check_reference(model: ModelFile) -> None:
     """Compute the card's reference rays at every state that has some: they show whether a coefficient has changed."""
     states = model.card.get("states") or {}
-    references = [(default_state(model.card), model.card.get("reference"))]
-    references += [(tuple(r["state"]), r) for r in states.get("reference", ())]
+    references = [
+        (default_state(model.card), model.card.get("reference")),
+        *((tuple(r["state"]), r) for r in states.get("reference", ())),
+    ]
     for state, reference in references:
         with damage_said(model.path, "card: reference"):
             _check_rays(model, state, reference)

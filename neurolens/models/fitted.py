@@ -54,12 +54,13 @@ class Domain:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the domain as data for JSON, with infinity as the string "inf"."""
-        data = {
-            f.name: getattr(self, f.name) for f in fields(self)
-        }  # a zoom mixes many: asdict takes ten times as long
-        data["focus_m"] = ["inf" if math.isinf(f) else f for f in self.focus_m]
-        data["bounds"] = {f.name: getattr(self.bounds, f.name) for f in fields(self.bounds)}
-        return data
+        return {
+            **{
+                f.name: getattr(self, f.name) for f in fields(self)
+            },  # a zoom mixes many: asdict takes ten times as long
+            "focus_m": ["inf" if math.isinf(f) else f for f in self.focus_m],
+            "bounds": {f.name: getattr(self.bounds, f.name) for f in fields(self.bounds)},
+        }
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> Domain:

@@ -275,9 +275,16 @@ class RayJob:
     @property
     def about(self) -> dict[str, Any]:
         """Return what a file of these rays says of itself."""
-        said = {f.name: getattr(self.settings, f.name) for f in fields(self.settings)}
-        said |= {"version": __version__, "width": self.grid.width, "height": self.grid.height, "passed": self.passed}
-        said |= {"compact_px": self.compact_px, "to_world": self.to_world, "camera": self.camera.settings}
+        said = {
+            **{f.name: getattr(self.settings, f.name) for f in fields(self.settings)},
+            "version": __version__,
+            "width": self.grid.width,
+            "height": self.grid.height,
+            "passed": self.passed,
+            "compact_px": self.compact_px,
+            "to_world": self.to_world,
+            "camera": self.camera.settings,
+        }
         return dict(plain(said))
 
     def arrays(

@@ -119,9 +119,12 @@ def library_of(
         made["psf"] = np.pad(made["psf"], [(0, 0), (0, 0), (room, room), (room, room)])
     states, (columns, rows) = (len(lenses), len(distances_m)), grid
     arrays = {name: np.array([made[name] for made in found]) for name in found[0]}
-    arrays = {name: a.reshape(*states, rows, columns, *a.shape[2:]) for name, a in arrays.items()}
-    arrays["place_mm"] = np.array(task.places_mm[:-1]).reshape(rows, columns, 2)
-    return arrays | {"f_number": np.array([*lenses]), "distance_m": np.array(distances_m)}
+    return {
+        **{name: a.reshape(*states, rows, columns, *a.shape[2:]) for name, a in arrays.items()},
+        "place_mm": np.array(task.places_mm[:-1]).reshape(rows, columns, 2),
+        "f_number": np.array([*lenses]),
+        "distance_m": np.array(distances_m),
+    }
 
 
 def forget(folder: Path) -> None:

@@ -96,8 +96,13 @@ def check_model(
     if not well_known(fresh, findings.each):
         fresh = with_more(fresh, seed + _FRESH)
         findings = measure(fresh, onnx_predictor(model))
-    figures = {**findings.figures, "stopped_down": findings.stopped_down, "zones": findings.zones, "seed": seed}
-    figures["rays"] = len(fresh.held_out)
+    figures = {
+        **findings.figures,
+        "stopped_down": findings.stopped_down,
+        "zones": findings.zones,
+        "seed": seed,
+        "rays": len(fresh.held_out),
+    }
     return figures, promises_of(model.card["errors"], fresh, findings)
 
 

@@ -313,9 +313,11 @@ def library_row(path: Path, checked: bool = True, characters: bool = False) -> d
     with warned(path) as notes:
         try:
             lens = read_any(path)
-            row = lens_row(lens, check_lens(lens) if checked else None)
-            row["character"] = character_or_none(lens)[0] if characters else None
-            row["t_stop"] = t_stop_of(lens) if characters else None
+            row = {
+                **lens_row(lens, check_lens(lens) if checked else None),
+                "character": character_or_none(lens)[0] if characters else None,
+                "t_stop": t_stop_of(lens) if characters else None,
+            }
         except NeurolensError as error:
             row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
     return {"lens": path.stem, "file": str(path), **row, "notes": notes}

@@ -333,9 +333,12 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     if not folder.is_dir():
         raise InputError(folder, "run folder", "(missing)", "a folder that exists")
     wall = None if results.wall_s is None else f"{results.wall_s:.0f} s in all"
-    parts = {"Lens": results.lens, "Domain": results.domain}
-    parts["Seed and versions"] = {"seed": results.seed, **results.versions}
-    parts["Image comparison"] = results.image_settings or {}
+    parts = {
+        "Lens": results.lens,
+        "Domain": results.domain,
+        "Seed and versions": {"seed": results.seed, **results.versions},
+        "Image comparison": results.image_settings or {},
+    }
     page = html(
         "report.html",
         title=str(results.title or results.lens.get("name") or "neurolens run"),

@@ -308,9 +308,13 @@ def _compare_scene(
     exact = renders[EXACT]
     captions, maps = {}, {}
     for name, pictures in renders.items():
-        record: dict[str, Any] = {"name": f"{scene.name}, {name}", "scene": scene.name, "camera": name}
-        record |= {f"file_{kind}": f"{folder.name}/{_stem(scene, name)}.{kind}" for kind in ("png", "exr")}
-        record["samples"] = choice.samples * choice.seeds
+        record: dict[str, Any] = {
+            "name": f"{scene.name}, {name}",
+            "scene": scene.name,
+            "camera": name,
+            **{f"file_{kind}": f"{folder.name}/{_stem(scene, name)}.{kind}" for kind in ("png", "exr")},
+            "samples": choice.samples * choice.seeds,
+        }
         if name != EXACT:
             errors = compare(pictures, exact)
             record |= asdict(errors)

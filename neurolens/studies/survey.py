@@ -444,8 +444,12 @@ def _page(
 
 def _remarks(record: Mapping[str, Any]) -> list[str]:
     """Return why a file was refused, doubts, notes, and promises of the card that were not held, each once."""
-    lines = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
-    lines += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]
+    lines = [
+        record["reason"],
+        *record.get("doubts", ()),
+        *record.get("notes", ()),
+        *(f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())),
+    ]
     return list(filter(None, dict.fromkeys(lines)))
 
 

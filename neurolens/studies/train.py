@@ -175,9 +175,12 @@ def _race(experiment: Experiment, prepared: Prepared, measured: Sequence[Measure
     if not chosen.rounds:
         return Race({}, {})
     with progress.stage("race for speed") as report:
-        candidates = [exact_candidate(lens, domain), exact_c_candidate(lens, domain)]
-        candidates += model_candidates({m.settings.label: m.file for m in measured}, domain)
-        candidates += ideal_cameras(lens, domain)
+        candidates = [
+            exact_candidate(lens, domain),
+            exact_c_candidate(lens, domain),
+            *model_candidates({m.settings.label: m.file for m in measured}, domain),
+            *ideal_cameras(lens, domain),
+        ]
         timed = race(candidates, domain, rounds=chosen.rounds, report=report)
     for m in measured:
         cost = m.record["fit_s"], m.record["load_s"]

@@ -143,8 +143,7 @@ def exact_lens(file: Path, zoom: str | float | None, report: Report) -> tuple[st
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
     if ranged and internal:  # refused before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
-    lines = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
-    lines.append(TRANSMITTANCE)
+    lines = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]}).", TRANSMITTANCE]
     if not (ranged or internal):
         at = set_lens(lens, zoom=state)
         return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), lines

@@ -340,9 +340,13 @@ def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
     stop = lens.stop_radius_mm * rng.uniform(0.2, 1.6, (1, count)).clip(max=1)
-    inputs = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
-    inputs["film_z_mm"] = rng.uniform(*lens.film_z_mm, (1, count))
-    inputs["wavelength_nm"] = rng.uniform(*lens.wavelength_nm, (1, count))
+    inputs = {
+        "film_mm": film,
+        "square": rng.random((2, count)),
+        "stop_radius_mm": stop,
+        "film_z_mm": rng.uniform(*lens.film_z_mm, (1, count)),
+        "wavelength_nm": rng.uniform(*lens.wavelength_nm, (1, count)),
+    }
     sample = evaluate(pupil.graph, inputs)
     inputs["rays"] = np.concatenate([film, sample["pupil_mm"], inputs["wavelength_nm"]])
     inputs |= {name: sample[name] for name in ("at_stop",) if name in sample}
@@ -360,10 +364,18 @@ def _per_exposure(camera: OslCamera) -> Array:
     rows, values = [], []
     for z, share in itertools.product(positions, (0.1, 0.3, 0.5, 0.7, 0.85, 1.0)):
         per_distance = 1 / (z - camera.lens.table.pupil_z_mm)
-        call = {"film_z_mm": z, "stop_radius_mm": share * camera.lens.stop_radius_mm}
-        call |= {"per_distance": per_distance, "scale": per_distance**2}
-        inputs: dict[str, NDArray[Any]] = {k: np.array([[v]]) for k, v in call.items()}
-        inputs |= {"film_mm": np.zeros_like(square), "square": square, "wavelength_nm": nanometres[None]}
+        call = {
+            "film_z_mm": z,
+            "stop_radius_mm": share * camera.lens.stop_radius_mm,
+            "per_distance": per_distance,
+            "scale": per_distance**2,
+        }
+        inputs: dict[str, NDArray[Any]] = {
+            **{k: np.array([[v]]) for k, v in call.items()},
+            "film_mm": np.zeros_like(square),
+            "square": square,
+            "wavelength_nm": nanometres[None],
+        }
         inputs |= evaluate(camera.pupil.graph, inputs)
         inputs["rays"] = np.concatenate([inputs["film_mm"], inputs["pupil_mm"], inputs["wavelength_nm"]])
         ray = evaluate(camera.lens.graph, inputs)

@@ -326,8 +326,12 @@ def _beside(lens: ShaderLens, image: StopImage) -> float:
     Where an image folds, two pupil points show one point of the stop.
     """
     rays = draw_rays(lens, None, 5)
-    inputs = {"film_mm": rays.film_mm, "point_mm": rays.point_mm}
-    inputs |= {"film_z_mm": rays.film_z_mm[None], "wavelength_nm": rays.wavelength_nm[None]}
+    inputs = {
+        "film_mm": rays.film_mm,
+        "point_mm": rays.point_mm,
+        "film_z_mm": rays.film_z_mm[None],
+        "wavelength_nm": rays.wavelength_nm[None],
+    }
     away = np.hypot(*(evaluate(image.graph, inputs)["pupil_mm"] - rays.pupil_mm)) > _BESIDE * rays.pupil_mm.std()
     part = (np.square(rays.film_mm).sum(0) / lens.film_radius_mm**2 * _ZONES[0]).astype(np.intp)
     return float((np.bincount(part, away) / np.maximum(np.bincount(part), _FEW)).max())
@@ -357,8 +361,12 @@ def _beyond_discs(lens: ShaderLens, pupil: PupilCircles, seed: int) -> list[Arra
     beyond, zones = [], []
     for k in range(_DRAWN):
         rays = draw_rays(lens, None, seed + k)
-        inputs = {"film_mm": rays.film_mm, "point_mm": 0 * rays.point_mm}
-        inputs |= {"film_z_mm": rays.film_z_mm[None], "wavelength_nm": rays.wavelength_nm[None]}
+        inputs = {
+            "film_mm": rays.film_mm,
+            "point_mm": 0 * rays.point_mm,
+            "film_z_mm": rays.film_z_mm[None],
+            "wavelength_nm": rays.wavelength_nm[None],
+        }
         middle, by_x, by_y = evaluate(pupil.image.graph, inputs).values()
         way, area = rays.pupil_mm - middle, by_x[0] * by_y[1] - by_x[1] * by_y[0]
         x, y = (way[0] * by_y[1] - way[1] * by_y[0]) / area, (by_x[0] * way[1] - by_x[1] * way[0]) / area

@@ -266,8 +266,10 @@ def thumbnail(layout: Layout) -> str:
         for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False)
         if front.n_after >= _AIR
     ]
-    parts = [path(glass, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='7'", "Z")]
-    parts.append(path((s.arc()[[0, -1]] for s in layout.surfaces if s.ideal), "stroke='#3d5a75' stroke-width='12'"))
+    parts = [
+        path(glass, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='7'", "Z"),
+        path((s.arc()[[0, -1]] for s in layout.surfaces if s.ideal), "stroke='#3d5a75' stroke-width='12'"),
+    ]
     rays = layout.rays[:: RAYS_A_FIELD // 2]
     for k, colour in enumerate(_SVG_RAYS):
         drawn = (r.points for r in rays if r.field % len(_SVG_RAYS) == k)

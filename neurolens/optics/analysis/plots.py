@@ -180,8 +180,12 @@ def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: 
 def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
     """Plot MTF against frequency: a colour per field, tangential solid, sagittal dashed."""
     text = f"Geometric MTF at {_wavelengths(data.wavelength_nm)}, without diffraction; {subtitle}"
-    labels: dict[str, Any] = {"xlabel": "frequency (cycles/mm)", "ylabel": "contrast", "ylim": (0, 1.02)}
-    labels["xlim"] = (0, data.frequency_per_mm[-1])
+    labels: dict[str, Any] = {
+        "xlabel": "frequency (cycles/mm)",
+        "ylabel": "contrast",
+        "ylim": (0, 1.02),
+        "xlim": (0, data.frequency_per_mm[-1]),
+    }
     with _curves(path, (8.4, 6.0), title, text, labels, columns=4) as axes:
         for k, field in enumerate(data.field_deg):
             both = (("tangential", data.tangential, "-"), ("sagittal", data.sagittal, "--"))
@@ -196,8 +200,12 @@ def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
 def plot_mtf_over_height(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
     """Plot MTF against image height: a colour per frequency, tangential solid, sagittal dashed."""
     text = f"Geometric MTF at {_wavelengths(data.wavelength_nm)}, without diffraction; {subtitle}"
-    labels: dict[str, Any] = {"xlabel": "image height (mm)", "ylabel": "contrast", "ylim": (0, 1.02)}
-    labels["xlim"] = (0, float(np.nanmax(data.height_mm)))
+    labels: dict[str, Any] = {
+        "xlabel": "image height (mm)",
+        "ylabel": "contrast",
+        "ylim": (0, 1.02),
+        "xlim": (0, float(np.nanmax(data.height_mm))),
+    }
     with _curves(path, (7.4, 5.4), title, text, labels, columns=len(data.frequency_per_mm)) as axes:
         for k, frequency in enumerate(data.frequency_per_mm):
             for name, values, line in (("tangential", data.tangential, "-"), ("sagittal", data.sagittal, "--")):

@@ -194,9 +194,11 @@ class Shot:
 
     def record(self, takes: Collection[str]) -> dict[str, Any]:
         """Return what a camera's settings say of its shot, for JSON: film, focus (None is inf), and what it `takes`."""
-        found: dict[str, Any] = {"film_mm": list(self.film_mm)}
-        found |= {f.name: getattr(self, f.name) for f in fields(self) if f.name in takes}
-        found["focus_m"] = None if math.isinf(self.focus_m) else self.focus_m
+        found: dict[str, Any] = {
+            "film_mm": list(self.film_mm),
+            **{f.name: getattr(self, f.name) for f in fields(self) if f.name in takes},
+            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
+        }
         return found | ({"aperture": self.aperture.settings()} if self.aperture else {})
 
     def f_number_for(self, widest: float) -> float | None:

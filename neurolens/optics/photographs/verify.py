@@ -364,8 +364,10 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
 
 def _check_focal_length(lens: Lens, profile: Profile) -> None:
     """Raise InputError where no focal length of the profile is one of the lens."""
-    efl = [float(first_order(at_infinity(lens)).efl_mm)]
-    efl += [c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None]
+    efl = [
+        float(first_order(at_infinity(lens)).efl_mm),
+        *(c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None),
+    ]
     low, high = min(efl) * (1 - _OTHER_FOCAL), max(efl) * (1 + _OTHER_FOCAL)
     if not any(low <= focal <= high for focal in profile.focal_mm):
         expected = " or ".join(f"{focal:g} mm" for focal in profile.focal_mm[:4])

@@ -84,8 +84,10 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     if data.get("rims", "(missing)") not in RIMS:
         expected = 'where the diameters come from: "source", "estimated", "derived" or "photographs"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
-    stated: dict[str, Any] = {key: table.text(key) for key in ("name", "source", "rims")}
-    stated |= {key: table.text(key, required=False) for key in ("believed_to_be", "designer", "mount", "notes")}
+    stated: dict[str, Any] = {
+        **{key: table.text(key) for key in ("name", "source", "rims")},
+        **{key: table.text(key, required=False) for key in ("believed_to_be", "designer", "mount", "notes")},
+    }
     numbers = ("image_radius_mm", "efl_mm", "efl_x_mm", "most_tilt_deg", "most_shift_mm")
     stated |= {HEAD[key]: table.optional(key) for key in numbers}
     lens = Lens(
@@ -303,8 +305,11 @@ def write_lens(lens: Lens, path: str | Path) -> None:
 
 def format_lens(lens: Lens) -> str:
     """Return the text of a lens file."""
-    values = {"schema": SCHEMA} | {key: getattr(lens, field) for key, field in HEAD.items()}
-    values["f_number"] = float(lens.f_number)
+    values = {
+        "schema": SCHEMA,
+        **{key: getattr(lens, field) for key, field in HEAD.items()},
+        "f_number": float(lens.f_number),
+    }
     head = {key: value for key, value in values.items() if value not in (None, "", ())}
     lines = [f"{key} = {format_value(value)}" for key, value in head.items()]
     notes = " ".join(text for text in (lens.notes, lens.derived) if text)

@@ -216,8 +216,11 @@ def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout
     chosen = arriving[torch.linspace(0, len(arriving) - 1, min(lines, len(arriving))).long()]
     scene = Scene(lens, math.inf)
     way = (scene.film_z_mm - path.rays.z) / path.rays.dz
-    points = [(rays.z, rays.y), *((z, y) for _, y, z in path.points)]
-    points.append((path.rays.z + way * path.rays.dz, path.rays.y + way * path.rays.dy))
+    points = [
+        (rays.z, rays.y),
+        *((z, y) for _, y, z in path.points),
+        (path.rays.z + way * path.rays.dz, path.rays.y + way * path.rays.dy),
+    ]
     label = f"{pair.name}, {len(arriving) / len(height):.0%} of the height"
     drawn = tuple(Line(np.array([[float(z[k]), float(y[k])] for z, y in points]), label, 0) for k in chosen)
     turns = ", then ".join(map(str, pair.reflections))

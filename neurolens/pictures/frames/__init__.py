@@ -400,8 +400,14 @@ def write_pictures(
 
     frame, files, (width, height) = prepared.frame, prepared.files, prepared.size
     space, camera = COLOUR_SPACES[prepared.film.colour_space], plain(prepared.camera.settings)
-    metadata: dict[str, Any] = {"version": __version__, "scene": str(frame.scene), "camera": camera}
-    metadata |= {"render": plain(result.stats), "colour": space.stated, "diffraction": frame.diffraction}
+    metadata: dict[str, Any] = {
+        "version": __version__,
+        "scene": str(frame.scene),
+        "camera": camera,
+        "render": plain(result.stats),
+        "colour": space.stated,
+        "diffraction": frame.diffraction,
+    }
     if prepared.diffraction is not None:
         result = replace(result, rgb=prepared.diffraction(result.rgb))
     layers: Layers = {}

@@ -58,8 +58,13 @@ class _Grid(ctypes.Structure):
 @cache
 def _light_of_tile(bins: int) -> Any:
     """Return the function of `spill.c`, compiled once."""
-    known = {"LANES": LANES, "BINS": bins, "SAMPLES": columns.SAMPLES_A_PASS, "BRIGHTEST": f"{_BRIGHTEST_SAMPLE:g}f"}
-    known |= {name: getattr(columns, name) for name in ("LUMINANCE2", "DROPPED", "COLUMNS")}
+    known = {
+        "LANES": LANES,
+        "BINS": bins,
+        "SAMPLES": columns.SAMPLES_A_PASS,
+        "BRIGHTEST": f"{_BRIGHTEST_SAMPLE:g}f",
+        **{name: getattr(columns, name) for name in ("LUMINANCE2", "DROPPED", "COLUMNS")},
+    }
     call = load_compiled(c_source("pictures/render/spill.c", **known)).light_of_tile
     call.argtypes, call.restype = [*[ctypes.c_size_t] * 5, *[ctypes.c_void_p] * 8], None
     return call

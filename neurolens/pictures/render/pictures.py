@@ -90,8 +90,10 @@ def write_exr(
     if bad := int(np.sum(~np.isfinite(picture))):
         raise InputError(path, "rgb", f"({bad} values not finite)", "finite float32 values")
     stored = np.clip(picture, -_HALF_MAX, _HALF_MAX).astype(np.float16) if half else picture
-    channels = {name: stored[..., k] for k, name in enumerate(COLOURS)}
-    channels |= _layer_channels(path, layers or {}, picture.shape[:2])
+    channels = {
+        **{name: stored[..., k] for k, name in enumerate(COLOURS)},
+        **_layer_channels(path, layers or {}, picture.shape[:2]),
+    }
     write_channels(path, channels, space, metadata, attributes)
 
 
@@ -113,8 +115,12 @@ def write_channels(
         raise InputError(path, "metadata", f"({error})", "values that JSON can hold") from None
     if not path.parent.is_dir():
         raise InputError(path, "folder", str(path.parent), "a folder that exists")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, METADATA_KEY: text}
-    header["colorInteropID"] = "data" if space is None else space.interop_id
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        METADATA_KEY: text,
+        "colorInteropID": "data" if space is None else space.interop_id,
+    }
     if space is not None:
         header |= {"chromaticities": space.chromaticities, "adoptedNeutral": np.array(space.white, np.float32)}
     planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
@@ -402,10 +408,14 @@ def _lens(settings: Mapping[str, Any]) -> dict[str, Any]:
     card = settings.get("card") or {}
     lens = settings.get("lens") or card.get("lens") or {}
     state = settings.get("lens_state") or {}
-    found: dict[str, Any] = {name: state.get(key) for name, key in _STATE.items()}
     # The designer of a published prescription counts as its maker, else who published it.
-    found |= {"lensMake": lens.get("designer") or lens.get("source"), "lensModel": lens.get("name")}
-    found |= {"lensSerialNumber": lens.get("sha256"), "lensFirmwareVersion": card.get("fit", {}).get("method")}
+    found: dict[str, Any] = {
+        **{name: state.get(key) for name, key in _STATE.items()},
+        "lensMake": lens.get("designer") or lens.get("source"),
+        "lensModel": lens.get("name"),
+        "lensSerialNumber": lens.get("sha256"),
+        "lensFirmwareVersion": card.get("fit", {}).get("method"),
+    }
     point = str(settings.get("camera")).startswith(("pinhole", "fisheye-"))  # everything is in focus
     if "focus_m" in settings and not point:
         found["focus"] = math.inf if settings["focus_m"] is None else float(settings["focus_m"])

@@ -457,8 +457,10 @@ def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, An
             raise InputError(tile.path, "channels", sorted(planes), f"{sorted(channels)} as in {first.path}")
         for name, plane in planes.items():
             channels[name][slice(*tile.rows)] = plane
-    metadata = {key: value for key, value in first.metadata.items() if key != "tile"}
-    metadata["render"] = _statistics([tile.metadata["render"] for tile in tiles])
+    metadata = {
+        **{key: value for key, value in first.metadata.items() if key != "tile"},
+        "render": _statistics([tile.metadata["render"] for tile in tiles]),
+    }
     return channels, metadata
 
 

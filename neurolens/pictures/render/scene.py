@@ -321,9 +321,11 @@ def _check_camera(path: Path, settings: SceneSettings, triangles: Sequence[Trian
     """Check that the film's centre is not inside a solid: a sphere, a box, or a closed mesh with its front outside."""
     at = np.array(settings.camera.position_m)
     spheres, boxes = settings.spheres, settings.boxes
-    solids: dict[str, bool | np.bool_] = {f"meshes[{k}]": encloses(mesh, at) for k, mesh in enumerate(triangles)}
-    solids |= {f"spheres[{k}]": np.sum((at - s.centre_m) ** 2) < s.radius_m**2 for k, s in enumerate(spheres)}
-    solids |= {f"boxes[{k}]": np.all((at > b.min_m) & (at < b.max_m)) for k, b in enumerate(boxes)}
+    solids: dict[str, bool | np.bool_] = {
+        **{f"meshes[{k}]": encloses(mesh, at) for k, mesh in enumerate(triangles)},
+        **{f"spheres[{k}]": np.sum((at - s.centre_m) ** 2) < s.radius_m**2 for k, s in enumerate(spheres)},
+        **{f"boxes[{k}]": np.all((at > b.min_m) & (at < b.max_m)) for k, b in enumerate(boxes)},
+    }
     for name, inside in solids.items():
         if inside:
             position = list(settings.camera.position_m)

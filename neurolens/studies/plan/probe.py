@@ -277,9 +277,10 @@ def effect_maps(probed: Probe) -> Maps:
         "vignetting": passed - 1,
         "transmittance": np.sqrt((share * (by_wave - 1) ** 2).sum(1)),
     }
-    maps: Maps = {k: ("px", probed.on_film(v)) for k, v in parts.items()}
-    maps |= {k: ("relative", probed.on_film(v)) for k, v in light.items()}
-    return maps
+    return {
+        **{k: ("px", probed.on_film(v)) for k, v in parts.items()},
+        **{k: ("relative", probed.on_film(v)) for k, v in light.items()},
+    }
 
 
 def passed_share(probed: Probe) -> Array:

@@ -288,10 +288,12 @@ def _follow_zoom(camera: Any) -> None:
 
 def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
     """Return the state of everything that `apply` changes, JSON-able."""
-    kept = {name: getattr(camera, name) for name in _CAMERA}
-    kept["custom_shader"] = None if camera.custom_shader is None else camera.custom_shader.name
-    kept["use_dof"] = camera.dof.use_dof
-    kept["custom"] = {k: list(v) if hasattr(v, "to_list") else v for k, v in camera.cycles_custom.items()}
+    kept = {
+        **{name: getattr(camera, name) for name in _CAMERA},
+        "custom_shader": None if camera.custom_shader is None else camera.custom_shader.name,
+        "use_dof": camera.dof.use_dof,
+        "custom": {k: list(v) if hasattr(v, "to_list") else v for k, v in camera.cycles_custom.items()},
+    }
     return {"camera": kept, "scene": {"engine": scene.render.engine, "device": scene.cycles.device}}
 
 

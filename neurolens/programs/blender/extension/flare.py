@@ -136,8 +136,12 @@ def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, 
             for row in rows_now(context, found, frame, rays):
                 known.setdefault(str(row["light"]), []).append(row)
             setting = on_camera.setting_of(scene, found)
-            values = {"focus": setting.focus_m, "f-number": setting.f_number, "zoom": custom.get("zoom_mm")}
-            values |= {f"film-{name}": custom.get(name) for name in ("tilt", "swing")}
+            values = {
+                "focus": setting.focus_m,
+                "f-number": setting.f_number,
+                "zoom": custom.get("zoom_mm"),
+                **{f"film-{name}": custom.get(name) for name in ("tilt", "swing")},
+            }
             moved = (part * side for part, side in zip(setting.shift, setting.sensor_mm, strict=True))
             values |= dict(zip(("film-shift", "film-rise"), moved, strict=True))
             keys.append({"frame": frame} | {name: value for name, value in values.items() if value is not None})
