@@ -27,11 +27,13 @@ from neurolens.cameras.model import load_model
 from neurolens.cameras.shaders.lens_source import lens_program, pupil_planes_mm
 from neurolens.cameras.shaders.source import camera_program
 from neurolens.cli import main
+from neurolens.graph.adjoint import adjoint
 from neurolens.graph.program import _FOLDED, Program
-from neurolens.graph.shading import LANGUAGES
+from neurolens.graph.shading import LANGUAGES, REGISTERS, Cuda
 from neurolens.models.axes import mixture_of
 from neurolens.models.source import WRITERS, Fix, fixed_models, fused_program
 from neurolens.optics.lens.paraxial import film_z_mm
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds
 from neurolens.optics.setting.states import set_lens
@@ -243,6 +245,17 @@ def test_nvcc_takes_it(tmp_path: Path) -> None:
     )
     done = subprocess.run(["nvcc", "-cubin", "rays.cu"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(not WHOLE or not shutil.which("nvcc"), reason="no nvcc, or not make test-shading")
+def test_nvcc_makes_one_function_of_the_gradients_of_56_refractions(tmp_path: Path) -> None:
+    """A function of so many steps that it called stored and read 18 kB a ray for want of registers."""
+    ours = pytest.importorskip("neurolens.programs.torch")
+    lens = ours.LensCamera("panavision_anamorphic_zoom_21", Shot((24.9, 18.7), 5.0), dtype=ours.torch.float64)._lens
+    back = adjoint(lens.program, ours._FOUND, ours._GIVEN[:-1], REGISTERS)
+    (tmp_path / "lens.cu").write_text(Cuda(back, "lens").kernel())
+    subprocess.run(["nvcc", "-ptx", "lens.cu"], cwd=tmp_path, check=True)
+    assert re.findall(r"^(?:\.\w+ )*\.(entry|func)\b", (tmp_path / "lens.ptx").read_text(), re.MULTILINE) == ["entry"]
 
 
 def test_the_command_writes_models_and_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
