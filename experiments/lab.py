@@ -28,7 +28,7 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import plain
-from neurolens.base.settings import whole
+from neurolens.base.settings import LARGEST_SEED, whole
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
@@ -74,7 +74,7 @@ def option(*names: str, old: Sequence[str] = (), **settings: Any) -> Option:
     return add
 
 
-def count(name: str, default: int | None, text: str, least: int = 1, most: int | None = None) -> Option:
+def count(name: str, default: int | None, text: str, least: int = 1, most: int = LARGEST_SEED) -> Option:
     """An option that takes a whole number."""
     return option(f"--{name}", metavar="N", type=whole(least, most), default=default, help=text)
 

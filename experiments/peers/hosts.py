@@ -5,14 +5,15 @@ each host renders the scene with two seeds, whose difference is its noise; then 
 own, may differ by no more. Mitsuba takes weights, Newton rays by importance and the picture of weights. Newton's depth
 along the rays is held against our own intersection. The pictures are of all light, with colours.
 
-Needs mitsuba (libLLVM), newton and warp-lang; a host that is not installed is left out. Writes hosts.md, hosts.json and
-hosts.jpg.
+Needs mitsuba (with LLVM 17 or later), newton and warp-lang; a host that is not installed is left out. Writes hosts.md,
+hosts.json and hosts.jpg.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import Any
 
@@ -21,6 +22,7 @@ from PIL import Image
 
 import neurolens
 from experiments import lab
+from neurolens.base.errors import NeurolensError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
 from neurolens.optics.lens.shot import Shot
@@ -190,12 +192,21 @@ def depth_error(size: tuple[int, int]) -> dict[str, float]:
 HOSTS = {"our renderer": (ours, ""), "Mitsuba 3": (mitsuba, "mitsuba"), "Newton": (newton, "newton")}
 
 
+def here(module: str) -> bool:
+    """Whether a host can run: its package is installed and, for Mitsuba, an LLVM that is not too old."""
+    if module == "mitsuba":
+        with suppress(NeurolensError):
+            return bool(require_mitsuba("llvm_ad_rgb"))
+        return False
+    return not module or find_spec(module) is not None
+
+
 def compared(size: tuple[int, int], samples: int) -> list[lab.Row]:
     """For each host that is here: noise of a pixel, and its difference from our renderer, all in shares of the mean."""
     rows: list[lab.Row] = []
     reference, noise_of_ours = None, 0.0
     for k, (name, (picture, module)) in enumerate(HOSTS.items()):
-        if module and find_spec(module) is None:
+        if not here(module):
             continue
         first, second = (picture(size, samples, 10 * k + seed, True)[..., 1].astype(float) for seed in (1, 2))
         mean = first.mean()
@@ -235,7 +246,7 @@ def run(args: argparse.Namespace) -> None:
     """Render, compare, write."""
     size = args.width, round(args.width * FILM[1] / FILM[0])
     rows = compared(size, args.samples)
-    depth = depth_error(size) if find_spec("newton") else None
+    depth = depth_error(size) if here("newton") else None
     told = "" if depth is None else (
         f"Newton's depth along {depth['rays']} rays differs from our own intersection by {depth['median_mm']:.2g} mm "
         f"(median; 99% within {depth['p99_mm']:.2g}, worst {depth['worst_mm']:.2g} mm). {depth['grazing']} more pass "
@@ -248,7 +259,7 @@ def run(args: argparse.Namespace) -> None:
     }))  # fmt: skip
     pictures = []
     for name, (picture, module) in HOSTS.items():
-        if not module or find_spec(module):
+        if here(module):
             rgb = np.clip(picture(size, args.samples, 5, False), 0, 1)
             drawn = Image.fromarray((255 * linear_to_srgb(rgb.astype(np.float32)) + 0.5).astype(np.uint8))
             pictures.append(lab.labelled(drawn, name))

@@ -49,6 +49,7 @@ FILM_MM = 1e-3, 1e4  # a side
 WAVELENGTH_NM = 100.0, 20_000.0  # from lithography to thermal cameras
 LIGHT_NM = 400.0, 700.0  # of scenes, films and lenses that name no other
 EYE_NM = 380.0, 780.0  # what an eye sees at all
+LARGEST_SEED = (1 << 63) - 1  # that generators of random numbers take
 RANGE = "range"  # a zoom position that stands for all of them
 _UNIT = re.compile(r"(.+?)_(per_mm|px|mm|um|nm|m|deg|s)")
 _PLACEHOLDERS = {int: "N", float: "X", str: "NAME", Path: "FILE"}
@@ -198,11 +199,9 @@ def between(low: float, high: float, unit: str, kind: Callable[[str], Any] = flo
     return number(kind, lambda value: low <= value <= high, _expected(kind, (low, high), unit))
 
 
-def whole(least: int, most: int | None = None) -> Callable[[str], int]:
+def whole(least: int, most: int = LARGEST_SEED) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
-    largest = (1 << 63) - 1 if most is None else most  # the largest that generators of random numbers take
-    expected = _expected(int, (least, math.inf if most is None else most), "an integer")
-    return number(int, lambda value: least <= value <= largest, expected)
+    return between(least, most, "", int)
 
 
 def wavelengths_nm(text: str) -> tuple[float, ...]:

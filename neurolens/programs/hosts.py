@@ -26,6 +26,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.records import plain
 from neurolens.base.settings import (
     FILM_MM,
+    LARGEST_SEED,
     LIGHT_NM,
     WAVELENGTH_NM,
     check_bounds,
@@ -51,7 +52,6 @@ Arrays = dict[str, NDArray[Any]]
 Vector = tuple[float, float, float]
 BYTES_A_RAY = 44  # the most, with three weights
 MOST_COMPACT_PX = 0.01  # how far rays in 16 bytes may be off
-_LARGEST = (1 << 63) - 1  # the largest seed that generators of random numbers take
 _PROBES, _FLATTEST = 4096, 0.17  # rays that measure this; their least cosine to the axis, that of 80 degrees
 
 
@@ -174,9 +174,9 @@ class RaySettings:
 def _whole(name: str, value: Any, least: int) -> int:
     """Return an integer of at least `least`; anything else is refused."""
     with suppress(TypeError):
-        if least <= (number := operator.index(value)) <= _LARGEST:
+        if least <= (number := operator.index(value)) <= LARGEST_SEED:
             return number
-    raise InputError("rays", name, value, f"an integer from {least}")
+    raise InputError("rays", name, value, f"an integer from {least} to {LARGEST_SEED}")
 
 
 def _numbers(values: Any) -> tuple[float, ...]:

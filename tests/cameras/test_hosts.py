@@ -295,7 +295,8 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys: pytest.CaptureFixture[s
     out = tmp_path / "rays.npz"
     for words, said in (
         (("-o", tmp_path / "rays.pt"), "one of .npz, .safetensors, .exr"),
-        (("-o", tmp_path / "rays.exr", "--compact"), "in an EXR"),
+        (("-o", tmp_path / "rays.exr", "--compact"), f"got '{tmp_path / 'rays.exr'}', expected no --compact"),
+        (("-o", out, "--seed", 1 << 63), f"an integer from 0 to {(1 << 63) - 1}"),
         (("-o", out, "--samples", 0), "from 1 to 65536"),
         (("-o", out, "--position", "1,2"), "X,Y,Z"),
         (("-o", out, "--position", "0,0,0", "--look-at", "0,0,0"), "look_at_m"),

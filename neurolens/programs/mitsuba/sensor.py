@@ -49,7 +49,7 @@ FILM_WIDTH_MM = 36.0
 _MIDDLE_NM = 550.0
 _CLASSES: dict[str, type] = {}
 DEFAULT_VARIANT, WITHOUT_LLVM = "llvm_ad_spectral", "scalar_spectral"
-# LLVM 15 and 16, which Dr.Jit takes, abort the process on Mitsuba's kernels (seen with AVX-512); 19 works.
+# LLVM 15 and 16, which Dr.Jit takes, abort the process on Mitsuba's kernels; 19 works.
 _OLDEST_LLVM = 17
 _TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y
 
@@ -70,20 +70,22 @@ def require_mitsuba(variant: str | None = None) -> Any:
     """Import the module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
 
     Warns:
-        NeurolensWarning: there is no LLVM, or one so old that compiled variants may end the process. If no variant was
-            asked for, scalar_spectral is taken.
+        NeurolensWarning: no variant was asked for, and scalar_spectral is taken, for there is no LLVM, or one so old
+            that compiled variants end the process.
 
     Raises:
-        NeurolensError: Mitsuba is not installed, or the variant's compiler (LLVM, CUDA) is missing.
+        NeurolensError: Mitsuba is not installed, or the compiler of the variant that was asked for (LLVM, CUDA) is
+            missing or too old.
         InputError: this Mitsuba does not have the variant, or the variant carries neither RGB nor plain spectra.
     """
     mi, dr = libraries()
     wanted = variant or mi.variant() or DEFAULT_VARIANT
     if wanted.startswith("llvm") and (doubt := _llvm_doubt(dr)):
-        asked = variant or mi.variant()
-        told = f"{doubt}; the variant {WITHOUT_LLVM} needs none{'' if asked else ' and is taken'}"
-        warnings.warn(told, NeurolensWarning, stacklevel=2)
-        wanted = asked or WITHOUT_LLVM
+        told = f"{doubt}; the variant {WITHOUT_LLVM} needs none"
+        if variant or mi.variant():
+            raise NeurolensError(f"mitsuba variant {wanted}: {told}")
+        warnings.warn(f"{told} and is taken", NeurolensWarning, stacklevel=2)
+        wanted = WITHOUT_LLVM
     known = [v for v in mi.variants() if v.endswith(("_rgb", "_spectral"))]
     if wanted not in known:
         raise InputError("mitsuba", "variant", wanted, f"one of: {', '.join(known)}")

@@ -88,27 +88,34 @@ def assert_same(a: list[FloatArray], b: list[FloatArray], *, share: float = 0.01
     assert (off < 5 * error + share * brightness).all(), (off / brightness).max()
 
 
+def our_white(size: int, film_mm: float, lens: Camera, samples: int) -> FloatArray:
+    camera = {"position_m": [0, 0, 0], "look_at_m": [0, 0, 1], "focus_m": 3.9, "width": size, "height": size}
+    white = {"camera": camera | {"film_width_mm": film_mm, "film_height_mm": film_mm}}
+    white |= {"environment": {"colour": [1.0, 1.0, 1.0]}}
+    return our_render(scene_from_tables(white), lens, samples=samples, threads=1).rgb
+
+
 @pytest.mark.parametrize("name", LLVM)
 def test_white_stays_white_and_falls_off_as_ours(name: str, lens: Camera) -> None:
     mi = variant(name)
     seen = render(load_scene(furnace(mi, SIZE)), lens, spp=64)
-    white = {"camera": {"position_m": [0, 0, 0], "look_at_m": [0, 0, 1], "focus_m": 3.9, "width": SIZE, "height": SIZE}}
-    white |= {"environment": {"colour": [1.0, 1.0, 1.0]}}
-    white["camera"] |= {"film_width_mm": 26.0, "film_height_mm": 26.0}
-    ours = our_render(scene_from_tables(white), lens, samples=64, threads=1).rgb
+    ours = our_white(SIZE, 26.0, lens, 64)
     # A sample of one wavelength spreads by about 1.5 in each channel; a region has 4096, the picture 65536.
     np.testing.assert_allclose(regions([seen])[0], regions([ours])[0], atol=0.1)
     np.testing.assert_allclose(seen.mean(axis=(0, 1)), ours.mean(axis=(0, 1)), atol=0.02)
     assert seen[0, 0].mean() < 0.85  # vignetted
 
 
-def test_white_stays_white_where_the_lens_disperses(lens: Camera) -> None:
-    # On a fine film the four lanes are one wavelength; a crop around the axis, where white is 1.
+def test_white_has_the_tint_of_the_coatings_where_the_lens_disperses(lens: Camera) -> None:
+    # On a fine film the four lanes are one wavelength; a crop around the axis.
     mi = variant("llvm_ad_spectral")
     scene = furnace(mi, 1024)
     scene["sensor"]["film"] |= {"crop_width": 32, "crop_height": 32, "crop_offset_x": 496, "crop_offset_y": 496}
     seen = render(load_scene(scene), lens, spp=64)
-    np.testing.assert_allclose(seen.mean(axis=(0, 1)), 1, atol=0.01)
+    axis = make_camera(MODEL, Shot((26.0 / 32, 26.0 / 32), 3.9, 2.0))
+    tint = our_white(32, 26.0 / 32, axis, 256).mean(axis=(0, 1))
+    np.testing.assert_allclose(seen.mean(axis=(0, 1)), tint, atol=0.004)
+    assert tint[1] - tint[2] > 0.02  # blue is dimmed more than green
     assert seen.std() < 0.1  # independent wavelengths leave colour noise of 0.19
 
 
