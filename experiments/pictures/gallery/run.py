@@ -337,14 +337,15 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
         shown = None
         for index, (row, places) in enumerate(zip(rows, boxes, strict=True)):
             for k, (column, place) in enumerate(zip([*row.pictures, "difference"], places, strict=False)):
-                if column == "difference" and row.difference is None:
+                difference = row.difference if column == "difference" else None
+                if difference is None and column == "difference":
                     continue
                 axes = figure.add_axes(place)
                 x, y, width, height = row.window_mm
                 extent = (x - width / 2, x + width / 2, y - height / 2, y + height / 2)
                 look: dict[str, Any] = {"extent": extent, "interpolation": "nearest"}
-                if column == "difference":
-                    shown = axes.imshow(100 * row.difference, cmap="magma", vmin=0, vmax=100 * scale, **look)
+                if difference is not None:
+                    shown = axes.imshow(100 * difference, cmap="magma", vmin=0, vmax=100 * scale, **look)
                 else:
                     axes.imshow(to_srgb(lab.denoised(row.pictures[column]), row.exposure), **look)
                 _axes(axes, first=k == 0)
