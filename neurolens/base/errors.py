@@ -1,5 +1,6 @@
 """User-facing errors: one line with the file, the field, the value and the expected value."""
 
+import os
 import re
 import sys
 import warnings
@@ -41,6 +42,7 @@ def one_line(text: str, most: int) -> str:
 
 def _shown(value: object) -> str:
     try:
+        value = os.fspath(value) if isinstance(value, os.PathLike) else value
         return value if isinstance(value, str) and value.startswith("(") else repr(value)
     except (ValueError, RecursionError):  # an integer of 5000 digits, lists in lists
         return f"({type(value).__name__} that is too long to show)"
