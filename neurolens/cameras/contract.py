@@ -33,7 +33,7 @@ it: their W is w times the film's area for an area square to the ray, so that bo
 has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
 W L cos(theta_P) / (p N a) to the pixel of area a (mm^2) that holds the film point, for each of N points.
 
-Spectra. A path may carry several wavelengths along the scene ray of one of them, the hero (`SpectralCamera`). At the
+Spectra. A path may carry several wavelengths along the scene ray of one of them, the hero (`SpectralRays`). At the
 others, its companions, a lens that disperses takes the same scene ray from other film points, where their light
 belongs. Lenses keep etendue, so each wavelength would have drawn this ray with nearly the same density: n wavelengths
 that pass share a ray evenly. Each weighs 1 / n of its own T A cos^4(theta) / (Z^2 E0), with the hero's A, theta and Z,
@@ -148,7 +148,6 @@ class Camera(Protocol):
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Return rays of film points [2, N] (mm, lens frame), pupil samples [2, N] in [0, 1), wavelengths [N] (nm)."""
-        ...
 
 
 class DifferentialCamera(Camera, Protocol):
@@ -156,7 +155,6 @@ class DifferentialCamera(Camera, Protocol):
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Sample rays as `sample` does, and give their differentials, too."""
-        ...
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Return film points for scene points [3, N] (m, camera frame), pupil samples [2, N] and wavelengths [N] (nm).
@@ -167,33 +165,12 @@ class DifferentialCamera(Camera, Protocol):
         Raises:
             InputError: a model whose core gives no direction vectors.
         """
-        ...
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """Return the part [N] of the weights of `sample` that is the cos^4 law, or a fisheye projection's own law.
 
         It is given for every ray, passed or not. A weight divided by it is area times transmittance.
         """
-        ...
-
-
-class SpectralCamera(Camera, Protocol):
-    """The interface of cameras that disperse and know their companions.
-
-    Attributes:
-        companion_reach_mm: the largest distance along x and along y between the film points of a hero and of its
-            companions; None if the camera cannot place companions.
-    """
-
-    companion_reach_mm: tuple[float, float] | None
-
-    def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Return rays as `sample` does, for wavelengths [W, N] in nm, of which the first is the hero's.
-
-        Raises:
-            InputError: the camera cannot place companions.
-        """
-        ...
 
 
 def towards(vector: FloatArray, slope: FloatArray, fixed: FloatArray) -> RayDifferentials:

@@ -222,9 +222,9 @@ class LensCamera:
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """Return how far companions may lie from the hero's film point; see `SpectralCamera`.
+        """Return how far along x and along y companions may lie from the hero's film point.
 
-        It is None if too few rays pass, or if no polynomial follows the shift.
+        It is None if they cannot be placed: too few rays pass, or no polynomial follows the shift.
         """
         return self._shift.reach_mm if self._shift else None
 

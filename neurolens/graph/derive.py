@@ -235,9 +235,7 @@ def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Mov
 
 
 def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    if x[0] == x[1]:
-        return _times(d[0], x[0] * 2.0)
-    return _sum([_times(d[0], x[1]), _times(d[1], x[0])])
+    return _times(d[0], x[0] * 2.0) if x[0] == x[1] else _sum([_times(d[0], x[1]), _times(d[1], x[0])])
 
 
 def _choice(truth: Value, then: Moved, otherwise: Moved) -> Moved:

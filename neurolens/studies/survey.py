@@ -336,10 +336,7 @@ def survey(
     if missing:
         with progress.stage("survey") as report:
             for done, (task, data) in enumerate(run_each(executor, run_task, tasks), start=1):
-                if isinstance(data, Failed):
-                    record = _unread(task.name, "fault", data.reason)
-                else:
-                    record = json.loads(data)
+                record = _unread(task.name, "fault", data.reason) if isinstance(data, Failed) else json.loads(data)
                 write_kept(_record_file(out, task.name), record)
                 found[task.name] = _without_layout(record)
                 if record["reason"]:

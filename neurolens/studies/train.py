@@ -22,7 +22,6 @@ from neurolens.models.pairs import RayPairs, make_pairs
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.analysis.layout import lens_layout
 from neurolens.optics.lens.paraxial import first_order
-from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.check import card_errors, errors_at, random_states
 from neurolens.studies.experiment import Experiment, Pictures, Renders, keep_inputs
 from neurolens.studies.measure import (
@@ -144,7 +143,20 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress, rend
     data, facts = first_order(lens), {key: getattr(lens, key) for key in keys}
     return {
         "lens": {**facts, "file": Path(lens.path).name, "efl_mm": data.efl_mm, "f_number": data.f_number},
-        "domain": _describe_domain(lens, pairs),
+        "domain": {
+            "film_radius_mm": domain.film_radius_mm,
+            "f_number": data.f_number,
+            "wavelength_nm": list(domain.wavelength_nm),
+            "focus_m": ["infinity" if f == math.inf else f for f in domain.focus_m],
+            "nearest_m": domain.nearest_m,
+            "pupil_plane_z_mm": domain.pupil_z_mm,
+            "pupil_radius_mm": domain.pupil_radius_mm,
+            "passing_share": len(pairs.train) / pairs.tested,
+            "rays_train": len(pairs.train),
+            "rays_held_out": MORE * len(pairs.held_out),
+            "rays_rim": len(pairs.rim),
+            "pixel_um": pixel_um(domain),
+        },
         "settings": settings,
         "models": records,
         "target": target_record(records, within_um) if within_um else None,
@@ -224,24 +236,6 @@ def _draw(
         {"file": f"{folder.name}/{stem}.png", "title": title, "caption": caption, "wide": stem == "trade"}
         for stem, title, caption in figures
     ]
-
-
-def _describe_domain(lens: Lens, pairs: RayPairs) -> dict[str, Any]:
-    domain = pairs.domain
-    return {
-        "film_radius_mm": domain.film_radius_mm,
-        "f_number": first_order(lens).f_number,
-        "wavelength_nm": list(domain.wavelength_nm),
-        "focus_m": ["infinity" if f == math.inf else f for f in domain.focus_m],
-        "nearest_m": domain.nearest_m,
-        "pupil_plane_z_mm": domain.pupil_z_mm,
-        "pupil_radius_mm": domain.pupil_radius_mm,
-        "passing_share": len(pairs.train) / pairs.tested,
-        "rays_train": len(pairs.train),
-        "rays_held_out": MORE * len(pairs.held_out),
-        "rays_rim": len(pairs.rim),
-        "pixel_um": pixel_um(domain),
-    }
 
 
 def _of_many_states(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any]:

@@ -108,8 +108,35 @@ class OslCamera:
 
     @cached_property
     def per_exposure(self) -> Array:
-        """Return how the exposure depends on the stop and the film position; see `_per_exposure`."""
-        return _per_exposure(self)
+        """Fit the squared share of the stop over the exposure on the axis, by the stop and the film position.
+
+        The fit is by powers [N, M] of that share and of the film position, scaled to 1.
+        """
+        square, nanometres = stratified(_QUADRATURE, self.lens.wavelength_nm)
+        (low, high), (middle, half) = self.lens.film_z_mm, _film_position(self)
+        positions = np.linspace(low, high, 3) if high > low else np.array([low])
+        rows, values = [], []
+        for z, share in itertools.product(positions, (0.1, 0.3, 0.5, 0.7, 0.85, 1.0)):
+            per_distance = 1 / (z - self.lens.table.pupil_z_mm)
+            call = {
+                "film_z_mm": z,
+                "stop_radius_mm": share * self.lens.stop_radius_mm,
+                "per_distance": per_distance,
+                "scale": per_distance**2,
+            }
+            inputs: dict[str, NDArray[Any]] = {
+                **{k: np.array([[v]]) for k, v in call.items()},
+                "film_mm": np.zeros_like(square),
+                "square": square,
+                "wavelength_nm": nanometres[None],
+            }
+            inputs |= evaluate(self.pupil.graph, inputs)
+            inputs["rays"] = np.concatenate([inputs["film_mm"], inputs["pupil_mm"], inputs["wavelength_nm"]])
+            ray = evaluate(self.lens.graph, inputs)
+            weight = evaluate(weight_graph(), inputs | ray | {"lens_status": ray["status"]})["weight"]
+            rows.append((share, (z - middle) / half))
+            values.append(share**2 / float(np.mean(weight, dtype=np.float64)))
+        return _powers(np.array(rows), np.array(values), (4, len(positions)))
 
 
 @dataclass(frozen=True)
@@ -351,38 +378,6 @@ def _samples(lens: ShaderLens, pupil: PupilCircles, count: int = 32768) -> dict[
     inputs["rays"] = np.concatenate([film, sample["pupil_mm"], inputs["wavelength_nm"]])
     inputs |= {name: sample[name] for name in ("at_stop",) if name in sample}
     return {k: v.astype(np.float32) for k, v in inputs.items() if k not in ("film_mm", "square", "wavelength_nm")}
-
-
-def _per_exposure(camera: OslCamera) -> Array:
-    """Fit the squared share of the stop over the exposure on the axis.
-
-    The fit is by powers [N, M] of that share and of the film position, scaled to 1.
-    """
-    square, nanometres = stratified(_QUADRATURE, camera.lens.wavelength_nm)
-    (low, high), (middle, half) = camera.lens.film_z_mm, _film_position(camera)
-    positions = np.linspace(low, high, 3) if high > low else np.array([low])
-    rows, values = [], []
-    for z, share in itertools.product(positions, (0.1, 0.3, 0.5, 0.7, 0.85, 1.0)):
-        per_distance = 1 / (z - camera.lens.table.pupil_z_mm)
-        call = {
-            "film_z_mm": z,
-            "stop_radius_mm": share * camera.lens.stop_radius_mm,
-            "per_distance": per_distance,
-            "scale": per_distance**2,
-        }
-        inputs: dict[str, NDArray[Any]] = {
-            **{k: np.array([[v]]) for k, v in call.items()},
-            "film_mm": np.zeros_like(square),
-            "square": square,
-            "wavelength_nm": nanometres[None],
-        }
-        inputs |= evaluate(camera.pupil.graph, inputs)
-        inputs["rays"] = np.concatenate([inputs["film_mm"], inputs["pupil_mm"], inputs["wavelength_nm"]])
-        ray = evaluate(camera.lens.graph, inputs)
-        weight = evaluate(weight_graph(), inputs | ray | {"lens_status": ray["status"]})["weight"]
-        rows.append((share, (z - middle) / half))
-        values.append(share**2 / float(np.mean(weight, dtype=np.float64)))
-    return _powers(np.array(rows), np.array(values), (4, len(positions)))
 
 
 def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:

@@ -285,9 +285,7 @@ def film_z_mm(lens: Lens, focus_m: float) -> float:
 def image_z_mm(lens: Lens, object_z_mm: float) -> float:
     """Return the z (mm) of a point's paraxial image on the axis, at `Lens.reference_nm`; a pinhole's is its film."""
     data = first_order(lens)
-    if is_pinhole(lens):
-        return float(data.rear_focal_z_mm)
-    return float(data.image_z_mm(object_z_mm))
+    return float(data.rear_focal_z_mm if is_pinhole(lens) else data.image_z_mm(object_z_mm))
 
 
 def film_z_of_planes_mm(

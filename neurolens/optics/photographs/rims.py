@@ -93,18 +93,16 @@ class OpenLight:
         return np.asarray((inside * self.light).sum(axis=(1, 2)))
 
     def inside(self, surface: int, rim_mm: float) -> Array:
-        """Return the part of every cell [F, G, G] that a rim of this radius lets through."""
-        return _covered(rim_mm - self.radius_mm[surface], *self.slopes_mm[:, surface])
+        """Return the part of every cell [F, G, G] that a rim of this radius lets through: where the margin is positive.
 
-
-def _covered(margin: Array, a: Array, b: Array) -> Array:
-    """Return the part of a unit cell in which a linear function is positive, by its value in the middle and two slopes.
-
-    It is the convolution of two boxes as wide as the slopes, integrated up to the value.
-    """
-    margin = np.clip(np.nan_to_num(margin, neginf=-np.inf), -0.5 * (a + b), 0.5 * (a + b))
-    corners = (np.maximum(margin + x * a + y * b, 0) ** 2 * (4 * x * y) for x in (-0.5, 0.5) for y in (-0.5, 0.5))
-    return np.asarray(np.clip(sum(corners) / (2 * a * b), 0, 1))
+        The margin is linear in a cell. The part is the convolution of two boxes as wide as the slopes, integrated up to
+        the margin in the middle.
+        """
+        a, b = self.slopes_mm[:, surface]
+        margin = np.nan_to_num(rim_mm - self.radius_mm[surface], neginf=-np.inf)
+        margin = np.clip(margin, -0.5 * (a + b), 0.5 * (a + b))
+        corners = (np.maximum(margin + x * a + y * b, 0) ** 2 * (4 * x * y) for x in (-0.5, 0.5) for y in (-0.5, 0.5))
+        return np.asarray(np.clip(sum(corners) / (2 * a * b), 0, 1))
 
 
 def with_rims(lens: Lens, rims_mm: Array) -> Lens:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import mmap
 import os
 import threading
@@ -313,12 +312,9 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
             ):  # squares of luminance are largest
                 if not (columns.min() >= -most and columns.max() <= most):
                     raise ValueError("impossible sums")
-            spent = {name: float(value) for name, value in about["spent"].items()}
-            if not all(0 <= value <= _MOST_S for value in spent.values()):
-                raise ValueError("impossible times")
             film.done[:] = done
             film.begin()
-            return spent
+            return {name: float(value) for name, value in about["spent"].items()}
     except InputError as error:
         raise InputError(path, error.field, error.value, f"{error.expected}, {_AGAIN}") from None
     except FileNotFoundError:
@@ -337,7 +333,7 @@ def _check_tiling(path: Path, about: dict[str, Any], tiling: Tiling) -> None:
     if not isinstance(about["samples"], int) or not 1 <= about["samples"] < 1 << 31:
         raise ValueError(f"{about['samples']} samples")
     spent = about["spent"]
-    if set(spent) != set(SPENT) or not all(0 <= float(value) < math.inf for value in spent.values()):
+    if set(spent) != set(SPENT) or not all(0 <= float(value) <= _MOST_S for value in spent.values()):
         raise ValueError("impossible times")
     if (about["tile"], about["step"]) != (tiling.tile, tiling.step):
         expected = f"{tiling.samples} as asked now: below {max(tiling.step, about['step'])} samples none can be added"

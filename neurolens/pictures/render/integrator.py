@@ -154,10 +154,8 @@ def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, 
     rough, world, paths = vertex.rough, vertex.world, vertex.paths
     keys = keys.cut(0, rough)
     origin = vertex.start()[:, :rough]
-    if world.lights.count == 1:
-        choice = np.zeros(rough, np.float32)
-    else:
-        choice = sampler.draw(keys, first + dims.LIGHT_CHOICE)
+    alone = world.lights.count == 1
+    choice = np.zeros(rough, np.float32) if alone else sampler.draw(keys, first + dims.LIGHT_CHOICE)
     aimed = world.lights.sample(origin, choice, sampler.draw2(keys, first + dims.LIGHT))
     value, density = vertex.evaluate(aimed.direction)
     value *= aimed.scale

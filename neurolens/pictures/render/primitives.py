@@ -45,7 +45,6 @@ class Primitive(Protocol):
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
         """Write distance and surface number of the hits that are nearer than `best`."""
-        ...
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -175,10 +174,7 @@ class Box:
         # The number of the first face; `face` tells which.
         entry, exit_ = slabs(rays, self.low, self.high)
         ok = entry < exit_
-        if self.room:
-            distance = exit_
-        else:
-            distance = np.where(entry > NEAREST, entry, exit_)
+        distance = exit_ if self.room else np.where(entry > NEAREST, entry, exit_)
         ok &= distance > NEAREST
         ok &= distance < best
         _keep(ok, distance, self.first, best, found)
