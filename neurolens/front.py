@@ -25,8 +25,7 @@ from neurolens.base.files import TemporaryFolder
 from neurolens.base.progress import Progress
 from neurolens.base.settings import setting_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens
-from neurolens.cli import arguments as cli
-from neurolens.cli import command
+from neurolens.cli import arguments as cli, command
 from neurolens.cli.calls import Answer, call, command_of, parameters, signature_of
 from neurolens.models.file import read_model
 from neurolens.optics.lens.shot import Shot

@@ -15,8 +15,7 @@ from vignetting_oracle import vignetting_errors
 
 from neurolens.base.errors import ModelError
 from neurolens.cameras.model import OnnxLens, load_model
-from neurolens.cli import main
-from neurolens.cli import models as models_command
+from neurolens.cli import main, models as models_command
 from neurolens.models.file import read_model
 from neurolens.models.fitted import Domain, FilmRays
 from neurolens.models.pairs import passing_rays, sample_domain

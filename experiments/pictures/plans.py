@@ -37,9 +37,7 @@ from neurolens.optics.setting.pupils import image_radius_mm
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.render.scene import Scene, load_scene
 from neurolens.studies.experiment import near_limit_m
-from neurolens.studies.plan import candidates as choices
-from neurolens.studies.plan import footprints as prints
-from neurolens.studies.plan import plan as plans
+from neurolens.studies.plan import candidates as choices, footprints as prints, plan as plans
 from neurolens.studies.plan.probe import COUNTED, LIGHT, Probe, effects_of
 
 LENSES = (

@@ -22,8 +22,7 @@ import numpy as np
 
 import neurolens
 from neurolens.base.errors import InputError, NeurolensError, warn
-from neurolens.base.files import fingerprint_of, kept_in_cache, safe_name, sha256_of
-from neurolens.base.files import library as shipped
+from neurolens.base.files import fingerprint_of, kept_in_cache, library as shipped, safe_name, sha256_of
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
 from neurolens.base.report import BULK, Report
 from neurolens.base.settings import RANGE, setting

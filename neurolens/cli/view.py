@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import TemporaryFolder
-from neurolens.base.files import library as shipped
+from neurolens.base.files import TemporaryFolder, library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.base.report import PART, Report

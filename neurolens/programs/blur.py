@@ -19,8 +19,7 @@ from torch.utils.data import Dataset
 from neurolens.base.errors import InputError
 from neurolens.pictures.defocus.diffraction import shares
 from neurolens.pictures.render.images import read_picture
-from neurolens.pictures.render.sensor import about as about_sensor
-from neurolens.pictures.render.sensor import expose
+from neurolens.pictures.render.sensor import about as about_sensor, expose
 from neurolens.pictures.render.settings import SensorSettings
 from neurolens.programs.psf import Arrays, read_psf
 

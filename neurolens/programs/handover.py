@@ -12,8 +12,7 @@ import json
 import math
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple

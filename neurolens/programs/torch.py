@@ -24,8 +24,7 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.lenscamera import CompiledProgram, padded
-from neurolens.cameras.lenscamera import LensCamera as _Camera
+from neurolens.cameras.lenscamera import CompiledProgram, LensCamera as _Camera, padded
 from neurolens.cameras.lensfilm import whole_camera
 from neurolens.graph.adjoint import OUTER, adjoint
 from neurolens.graph.c import Signature

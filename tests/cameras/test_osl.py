@@ -14,8 +14,7 @@ from shipped import whole
 from neurolens.cameras.cameragraph import unit_disc
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cameras.shaders import blender_shader as shaders
-from neurolens.cameras.shaders import osl, pupil_fit, shader_lens
+from neurolens.cameras.shaders import blender_shader as shaders, osl, pupil_fit, shader_lens
 from neurolens.cameras.shaders.blender_shader import exact_lens
 from neurolens.cameras.shaders.pupil import Blades, PupilCircles, passing_share
 from neurolens.cameras.shaders.pupil_fit import fit_pupil

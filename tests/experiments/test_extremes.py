@@ -12,8 +12,7 @@ import torch
 from shipped import PATHS
 
 from experiments.__main__ import main
-from experiments.accuracy import extreme_cases as cases
-from experiments.accuracy import extremes
+from experiments.accuracy import extreme_cases as cases, extremes
 from experiments.accuracy.extremes import failures, measure, trace_reference
 from neurolens.base import status as st
 from neurolens.optics.lens.figures import Cylinder, Figure

@@ -16,8 +16,7 @@ from shipped import whole
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.find import INDEX
-from neurolens.cli import lens as lens_list
-from neurolens.cli import main
+from neurolens.cli import lens as lens_list, main
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.figures import Ideal
 from neurolens.optics.lens.prescription import Lens, Surface

@@ -29,8 +29,7 @@ from neurolens.optics.setting import focusing
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.render.pictures import read_exr
 from neurolens.pictures.render.scene import load_scene, scene_from_tables
-from neurolens.studies.plan import candidates as tried
-from neurolens.studies.plan import costs, effects_plot
+from neurolens.studies.plan import candidates as tried, costs, effects_plot
 from neurolens.studies.plan.candidates import Target, candidates
 from neurolens.studies.plan.costs import ALONE, Work, noise
 from neurolens.studies.plan.footprints import (

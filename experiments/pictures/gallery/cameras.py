@@ -32,8 +32,7 @@ from neurolens.models.fitted import Domain
 from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens, Surface
-from neurolens.optics.lens.shot import Shot as CameraShot
-from neurolens.optics.lens.shot import StopShape
+from neurolens.optics.lens.shot import Shot as CameraShot, StopShape
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.focusing import focused_inside
 from neurolens.optics.setting.states import set_lens

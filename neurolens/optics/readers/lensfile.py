@@ -15,11 +15,9 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.settings import WAVELENGTH_NM, said, within
 from neurolens.base.tomlfile import format_value, read_toml
-from neurolens.optics.lens import designs
-from neurolens.optics.lens import glass as catalogue
+from neurolens.optics.lens import designs, glass as catalogue
 from neurolens.optics.lens.apertures import Aperture
-from neurolens.optics.lens.figures import KEYS as FIGURE_KEYS
-from neurolens.optics.lens.figures import read_figure
+from neurolens.optics.lens.figures import KEYS as FIGURE_KEYS, read_figure
 from neurolens.optics.lens.glass import by_figures, check_against_table, index_at
 from neurolens.optics.lens.placement import MOST_DECENTRE_MM, MOST_TILT_DEG, Placement
 from neurolens.optics.lens.prescription import Coating, Configuration, Lens, Medium, Surface

@@ -7,8 +7,7 @@ import lens_models
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as some
+from hypothesis import given, strategies as some
 
 from experiments.accuracy.published import PublishedSettings, fit_any
 from experiments.accuracy.published.data import RawData, from_tangents, to_tangents

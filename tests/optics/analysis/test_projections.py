@@ -13,8 +13,7 @@ import pytest
 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import Field, field_of
-from neurolens.cli import main
-from neurolens.cli import stmap as command
+from neurolens.cli import main, stmap as command
 from neurolens.optics.analysis.projections import NAMES, Projection, fit, has_pole, inverse_polynomial, residual
 from neurolens.optics.lens.shot import Shot
 from neurolens.programs import handover as files

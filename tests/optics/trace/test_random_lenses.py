@@ -5,8 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as hs
+from hypothesis import HealthCheck, given, settings, strategies as hs
 from shipped import WHOLE, turned
 
 from experiments.accuracy.extreme_cases import Case, disc, unit

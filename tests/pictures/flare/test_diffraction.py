@@ -13,14 +13,12 @@ from shipped import whole
 
 from experiments.pictures.starburst import light_of, streaks
 from neurolens.base.errors import InputError
-from neurolens.optics.analysis.bundles import bundle
-from neurolens.optics.analysis.bundles import points as stop_points
+from neurolens.optics.analysis.bundles import bundle, points as stop_points
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.rays import Rays, trace
-from neurolens.pictures.flare import diffraction as d
-from neurolens.pictures.flare import exit_pupil as p
+from neurolens.pictures.flare import diffraction as d, exit_pupil as p
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.job import FlareJob, axis_irradiance
 from neurolens.pictures.flare.lights import Light, light_rays

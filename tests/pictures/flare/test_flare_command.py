@@ -14,8 +14,7 @@ from shipped import whole
 
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
-from neurolens.cli import flare as command
-from neurolens.cli import main
+from neurolens.cli import flare as command, main
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.readers.lensfile import read_lens

@@ -16,8 +16,10 @@ pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender
 
 from neurolens.base.errors import InputError  # noqa: E402
 from neurolens.cameras.shaders.blender_shader import Shader  # noqa: E402
-from neurolens.cli import blender as command  # noqa: E402
-from neurolens.cli import main  # noqa: E402
+from neurolens.cli import (
+    blender as command,  # noqa: E402
+    main,  # noqa: E402
+)
 from neurolens.optics.lens.paraxial import first_order  # noqa: E402
 
 LENS = "laikin_double_gauss_50"

@@ -11,8 +11,7 @@ from neurolens.cameras.contract import RAYS_A_CALL as BATCH
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.pictures.render.colour import ChannelWavelengths, SpectralRange
 from neurolens.pictures.render.film import PixelGrid
-from neurolens.programs.mitsuba import load_scene
-from neurolens.programs.mitsuba import sensor as library
+from neurolens.programs.mitsuba import load_scene, sensor as library
 from neurolens.programs.mitsuba.sensor import FilmRays, wavelength_samples
 
 FILM = (30.0, 20.0)

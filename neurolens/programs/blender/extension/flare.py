@@ -17,8 +17,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from . import camera as on_camera
-from . import lights
+from . import camera as on_camera, lights
 from .library import LensError
 from .panel import _Operator
 

@@ -10,8 +10,7 @@ from typing import Any
 import bpy
 import bpy.utils.previews
 
-from . import camera as on_camera
-from . import library as facts
+from . import camera as on_camera, library as facts
 from .library import LensError, LensFacts
 
 _FIRST = ("f_number", "focus_m", "zoom_mm")  # settings that come before the others
