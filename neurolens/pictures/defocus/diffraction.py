@@ -3,7 +3,9 @@
 Rays place light as geometry does, and waves then spread it. The blur of a point is here the blur of its rays convolved
 with the point spread that the same pupil (stop, blades, rims) has without aberrations. Far out of focus and near a
 perfect focus this is what sums of waves give; between, where aberrations are about a wave, it spreads too much. The
-pupil hardly depends on the depth of things, so that one kernel serves all depths of a zone. Kernels reach out to 118
+pupil hardly depends on the depth of things, so that one kernel serves all depths of a zone. Nor does it on that of the
+film: a zone of a turned film has the kernel of the upright film where the pupil sees it, whose width errs by the share
+by which the zone is nearer to the pupil or farther, and by the cosine of the turn. Kernels reach out to 118
 radii of Airy's disc or 127 pixels, whichever is less, and hold the streaks of blades so far; the light beyond is put
 back into them.
 """
@@ -22,7 +24,6 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.lens.shot import POSES
 from neurolens.pictures.defocus.plate import channel_wavelengths
 
 Array = NDArray[np.float64]
@@ -126,14 +127,14 @@ class Diffraction:
         `wavelengths_nm`: one wavelength for red, green and blue each, in place of those that make white light.
 
         Raises:
-            InputError: the camera is no lens, or its film does not stand upright.
+            InputError: the camera is no lens.
         """
         lens = lens_of(camera)
         channels = [(nm,) for nm in wavelengths_nm] if wavelengths_nm else list(channels_of("rgb", lens).values())
         low, high = camera.wavelength_nm or (0.0, math.inf)
         channels = [tuple(min(max(nm, low), high) for nm in some) for some in channels]
         focus_m = camera.settings.get("focus_m") or math.inf
-        places, pixel_mm = places_of(camera.film_mm, _ZONES), camera.film_mm[0] / size[0]
+        places, pixel_mm = on_upright(camera, places_of(camera.film_mm, _ZONES)), camera.film_mm[0] / size[0]
         made = np.array([s.light for s in spreads(lens, focus_m, places, channels, pixel_mm, perfect=True)])
         made = np.broadcast_to(made, (len(made), 3, *made.shape[2:])).copy()
         dark = made.sum((2, 3)) == 0
@@ -141,14 +142,22 @@ class Diffraction:
         made /= made.sum((2, 3), keepdims=True)
         return cls(made.reshape(_ZONES[1], _ZONES[0], *made.shape[1:]), size, tuple(channels))
 
-    def __call__(self, picture: FloatArray) -> FloatArray:
-        """Return a picture [H, W, 3] of linear light after diffraction; beyond its edges it is as at them."""
-        r = self.kernels.shape[-1] // 2
+    @property
+    def reach_px(self) -> int:
+        """Return how many pixels away a point sends light."""
+        return int(self.kernels.shape[-1] // 2)
+
+    def __call__(self, picture: FloatArray, began: int = 0) -> FloatArray:
+        """Return a picture [H, W, 3] of linear light after diffraction; beyond its edges it is as at them.
+
+        `began`: its first row in the whole picture.
+        """
+        r, (height, width) = self.reach_px, picture.shape[:2]
         around = np.pad(picture.astype(np.float64), [(r, r), (r, r), (0, 0)], mode="edge").transpose(2, 0, 1)
         found = np.zeros_like(around)
         columns, rows = (
-            list(shares((np.arange(n) + 0.5) / n, (np.arange(-r, pixels + r) + 0.5) / pixels))
-            for n, pixels in zip(_ZONES, self.size, strict=True)
+            list(shares((np.arange(n) + 0.5) / n, (np.arange(first - r, first + count + r) + 0.5) / pixels))
+            for n, pixels, first, count in zip(_ZONES, self.size, (0, began), (width, height), strict=True)
         )
         wide = np.pad(found, [(0, 0), (r, r), (r, r)])
         for j, (top, bottom), down in rows:
@@ -157,7 +166,6 @@ class Diffraction:
                 shape = bottom - top + 2 * r, right - left + 2 * r
                 spectrum = np.fft.rfft2(part, shape) * np.fft.rfft2(self.kernels[j, i], shape)
                 wide[:, top : bottom + 2 * r, left : right + 2 * r] += np.fft.irfft2(spectrum, shape)
-        height, width = picture.shape[:2]
         kept = wide[:, 2 * r : 2 * r + height, 2 * r : 2 * r + width]
         return np.asarray(kept.transpose(1, 2, 0), np.float32)
 
@@ -170,6 +178,14 @@ class Diffraction:
         return np.einsum("j,i,jicyx->cyx", rows, columns, self.kernels)
 
 
+def on_upright(camera: Any, places_mm: Sequence[Place]) -> list[Place]:
+    """Return where places of a picture (right, up) lie on the upright film behind its film, seen from the pupil."""
+    pose = camera.film.pose
+    x, y, depth = pose.axes[:, :2] @ (-np.array(places_mm) - pose.moved_mm).T
+    away = np.maximum(1 + depth / camera.film.distance_mm, 0.1)  # the film of a short lens may reach its pupil
+    return list(zip((-x / away).tolist(), (-y / away).tolist(), strict=True))
+
+
 def lens_of(camera: Any) -> Lens:
     """Return the lens of a camera as it is set."""
     lens = getattr(camera, "lens", None)
@@ -178,10 +194,8 @@ def lens_of(camera: Any) -> Lens:
         lens = replace(
             camera.model.fitted.lens.with_stop_radius(stop), film_z_mm=film, aperture=camera.film.scene.aperture
         )
-    if lens is None or any(camera.settings.get(name) for name in POSES):
-        raise InputError(
-            camera.name, "--diffraction", f"({camera.name})", "a lens file or a model of one, on an upright film"
-        )
+    if lens is None:
+        raise InputError(camera.name, "--diffraction", f"({camera.name})", "a lens file or a model of one")
     return lens
 
 

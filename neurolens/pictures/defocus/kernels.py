@@ -27,7 +27,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
-from neurolens.pictures.defocus.diffraction import MOST_PX, Diffraction, lens_of, spreads
+from neurolens.pictures.defocus.diffraction import MOST_PX, Diffraction, lens_of, on_upright, spreads
 from neurolens.pictures.defocus.plate import (
     FloatArray,
     Plate,
@@ -430,16 +430,17 @@ class Cell:
 def diffracted(camera: Camera, size: tuple[int, int], cells: Sequence[Cell], waves: Diffraction) -> list[Cell]:
     """Return the kernels of one distance with diffraction.
 
-    They are sums of waves over the pupils of their places. Where these would need too many points, or pixels, the
-    kernels by rays are spread by their zone's diffraction.
+    They are sums of waves over the pupils of their places. Where these would need too many points, or pixels, and on a
+    turned film, whose kernels are sharper on one side, the kernels by rays are spread by their zone's diffraction.
     """
     widest, r = max(cell.width_px for cell in cells), waves.kernels.shape[-1] // 2
     summed = None
-    if widest + 2 * _MARGIN <= MOST_PX:
+    if widest + 2 * _MARGIN <= MOST_PX and not camera.film.pose.turned:  # type: ignore[attr-defined]
         width, height = camera.film_mm
         places = [(cell.field[0] * width / 2, cell.field[1] * height / 2) for cell in cells]
         side, pixel_mm = min(widest + 2 * r, MOST_PX), camera.film_mm[0] / size[0]
-        summed = spreads(lens_of(camera), cells[0].distance_m, places, waves.channels, pixel_mm, side)
+        at = on_upright(camera, places)
+        summed = spreads(lens_of(camera), cells[0].distance_m, at, waves.channels, pixel_mm, side)
     found = []
     for k, cell in enumerate(cells):
         if summed is None or cell.kernel is None or summed[k].by_rays or not summed[k].inside.all():

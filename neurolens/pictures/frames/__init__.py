@@ -215,6 +215,12 @@ class Prepared:
     diffraction: Diffraction | None = None
 
     @property
+    def traced(self) -> tuple[int, int] | None:
+        """Return the rows that are rendered: those of the tile, and those whose light diffraction sends into it."""
+        r, height = self.diffraction.reach_px if self.diffraction else 0, self.size[1]
+        return self.rows and (max(self.rows[0] - r, 0), min(self.rows[1] + r, height))
+
+    @property
     def name(self) -> str:
         """Name scene and camera, for messages."""
         return f"{self.scene.name}, {self.camera.name}"
@@ -226,7 +232,7 @@ class Prepared:
         def taken(camera: Camera, watch: Watch | None) -> RenderResult:
             return render(
                 self.scene, camera, width=width, height=height, samples=frame.samples, seed=frame.seed,
-                threads=threads, max_depth=frame.max_depth, film=self.film, rows=self.rows, progress=progress,
+                threads=threads, max_depth=frame.max_depth, film=self.film, rows=self.traced, progress=progress,
                 watch=watch,
             )  # fmt: skip
 
@@ -276,13 +282,7 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
     error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
     if error > (pixel := 1e3 * camera.film_mm[0] / width):
         warn(f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um")
-    waves = None
-    if frame.diffraction:
-        if rows is not None:
-            raise InputError(
-                "neurolens render", "--diffraction", "(a tile)", "a whole picture: light goes across tiles"
-            )
-        waves = Diffraction.of(camera, (width, height))
+    waves = Diffraction.of(camera, (width, height)) if frame.diffraction else None
     return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows, waves)
 
 
@@ -408,17 +408,18 @@ def write_pictures(
         "colour": space.stated,
         "diffraction": frame.diffraction,
     }
+    rows, (began, _) = prepared.rows or (0, height), prepared.traced or (0, height)
+    own, layers = slice(rows[0] - began, rows[1] - began), Layers()
     if prepared.diffraction is not None:
-        result = replace(result, rgb=prepared.diffraction(result.rgb))
-    layers: Layers = {}
+        result = replace(result, rgb=prepared.diffraction(result.rgb, began)[own])
     if frame.channels == "all" or not result.stats.complete:
-        layers, metadata["layers"] = asdict(result.layers), dict(MEANING)
+        layers = {name: channel[own] for name, channel in asdict(result.layers).items()}
+        metadata["layers"] = dict(MEANING)
     for k, layer in enumerate(result.behind, 1):
         behind = converted(layer.rgb, conversion(SRGB, space)).astype(np.float32)
         layers |= {f"behind{k}.{c}": behind[..., n] for n, c in enumerate("RGB")}
         layers |= {f"behind{k}.A": 1 - layer.layers.blocked, f"behind{k}.Z": layer.layers.depth}
         metadata["layers"][f"behind{k}"] = f"what follows the first {k} things on each ray; premultiplied"
-    rows = prepared.rows or (0, height)
     if (sensor := prepared.sensor) is not None:
         added = (flare[name][slice(*rows)] for name in LAYERS if name in flare)  # flare also covers what stands behind
         layers |= expose(sum(added, start=result.rgb), sensor, frame.seed, rows[0])
