@@ -12,7 +12,9 @@ rays in it. The path along the very ray of S would have the error of R in full, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -35,18 +37,20 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays
 
 _RAYS = 28  # along a side of the box about what passes
-_LINE = np.linspace(-1, 1, _RAYS)
-_SQUARE = np.stack(np.meshgrid(_LINE, _LINE)).reshape(2, -1)
-_ROOM = 1.1  # the box over what passes
+# Pupils fill ellipses in their boxes, in which rays are taken: in two spirals of half the golden angle, as many in each
+# part. Ellipses lean by the correlation of x and y, of which few steps are told apart, so that fits are kept.
+_ELLIPSE, _LEANS, _FEW, _MANY = 0.96, 32, 256, 800
+_ENOUGH = 240  # of the few rays: where rims shut out more, many are taken
+_ROOM = 1.1  # the ellipse over what passes
 _AT_ONCE = 4  # places whose rays are evaluated in one go
 _FAR_UM = 1e30
 # Graphs of models, and the same compiled where the machine has a compiler.
 _KNOWN: WeakKeyDictionary[Phased, tuple[Graph, CompiledGraph | None]] = WeakKeyDictionary()
 # Rays up to so many radii of stop and rims count: before they are led to the source (the second: may pass), and after.
-_NEAR, _ASIDE, _BEYOND = 1.2, 1.04, 1.1
+_NEAR, _BEYOND = 1.2, 1.1
 _RIM = 2.0  # a gate is (height / rim radius)^2 - 1; with this added it stands for a height and a rim of this radius
 _ASTRAY = 0.05  # pupil radii from a ray on the focal plane to the other whose path is taken for its own
-_NEWTON = 8  # steps from a direction to its point on the focal plane
+_NEWTON = 6  # steps from a direction to its point on the focal plane
 _SEARCH, _ROUNDS = 65, 3  # points among which the chief ray is sought, and how often
 
 
@@ -95,6 +99,15 @@ def model_pupils(
     return found
 
 
+@lru_cache(maxsize=64)
+def _spirals(count: int, correlation: float = 0.0) -> Array:
+    """Return points [2, N] of an ellipse that touches the sides of its box, by the correlation of x and y."""
+    turn = math.pi * (3 - math.sqrt(5)) / 2 * (np.arange(count // 2) + 0.5)
+    half = _ELLIPSE * np.sqrt(turn / turn[-1]) * np.stack([np.cos(turn), np.sin(turn)])
+    high, low = math.sqrt(1 + correlation) / 2, math.sqrt(1 - correlation) / 2
+    return np.array([[high + low, high - low], [high - low, high + low]]) @ np.concatenate([half, -half], 1)
+
+
 def _forwards(cosines: Array) -> Array:
     """Return the third direction cosine [N] of light, which goes towards the film."""
     return np.asarray(np.sqrt(np.maximum(1 - (cosines * cosines).sum(0), 1e-6)))
@@ -122,7 +135,6 @@ class _Known:
 
     def __init__(self, model: LensModel, core: Phased, scene: Scene, wavelengths_nm: Sequence[float]) -> None:
         self.model, self.core, self.scene, self.waves = model, core, scene, wavelengths_nm
-        self.front = np.array([0.0, 0.0, core.front_z_mm])
         if core not in _KNOWN:
             graph = _graph(model, core)
             _KNOWN[core] = graph, CompiledGraph.of(graph, {"film_z_mm": 0.0}) if has_compiler() else None
@@ -130,8 +142,7 @@ class _Known:
 
     def rays(self, point: Array, cosines: Array, z_mm: float, nm: Array | float) -> dict[str, Array]:
         """Return what the model says of rays through points [2, N] of a plane, by cosines [2, N] of light."""
-        slope = cosines / _forwards(cosines)
-        pupil = point + slope * (self.model.domain.pupil_z_mm - z_mm)
+        pupil = point + cosines / _forwards(cosines) * (self.model.domain.pupil_z_mm - z_mm)
         rows = np.concatenate([*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))])
         if self.run is None:
             found = evaluate(self.graph, {"rays": rows, "film_z_mm": np.full((1, 1), z_mm)})
@@ -139,53 +150,66 @@ class _Known:
         self.run.numbers[:] = z_mm
         return {name: a.astype(np.float64) for name, a in self.run({"rays": rows.astype(np.float32)}).items()}
 
-    def pupils(self, place: Array) -> list[list[ExitPupil | None]]:
-        """Return the pupils of film places [2, P], by place and wavelength; None where no light arrives."""
+    def pupils(self, place: Array, count: int = _FEW) -> list[list[ExitPupil | None]]:
+        """Return the pupils of film places [2, P], by place and wavelength, from so many rays; None without light."""
         film_z, focal_z, stop_mm = self.scene.film_z_mm, self.core.focal_z_mm, self.scene.lens.stop_radius_mm
         chief, seen = self._chief(place)
-        middle, half, lit = self._box(place)
-        places, count, waves = place.shape[1], len(_SQUARE[0]), len(self.waves)
+        middle, half, lean, lit = self._box(place)
+        places, waves, points = place.shape[1], len(self.waves), [_spirals(count, c) for c in lean.tolist()]
 
         def each(values: Array) -> Array:
-            """Repeat values of places for their rays."""
-            return np.repeat(values, count, 1)
+            return np.repeat(values, count, 1)  # of places, for their rays
 
         source = self._source(each(seen))
-        cosines = each(middle) + each(half) * np.tile(_SQUARE, places)
+        cosines = each(middle) + each(half) * np.concatenate(points, 1)
         light = np.concatenate([cosines, _forwards(cosines)[None]])
         point, axis = each(place + chief * (focal_z - film_z)), each(seen[3:])
-        out = self.rays(point, cosines, focal_z, self.waves[0])
-        foot, leaves, _ = foot_of(self.core, out["ray"])
+        first = self.rays(point, cosines, focal_z, self.waves[0])
+        foot, leaves, _ = foot_of(self.core, first["ray"])
         way = axis if source is None else (source - foot) / np.linalg.norm(source - foot, axis=0)
         slope, back = light[:2] / light[2], self.model.domain.pupil_z_mm - focal_z
-        # Far outside the stop a model may fold: rays from there come back into it.
-        stop = out["stop"]  # of these rays, it is a rim, too: beyond it polynomials of the others may come back
-        near = self._passes(out, point + slope * back, _NEAR * stop_mm, _NEAR**2 - 1)
         # Rays of the source, by cosines: where those that leave so much aside come from. Then those with s(P) = d, or
         # between both, where they come from far: rays outside its pupil are none that the model knows.
-        even, many = self._point_of(way), (np.tile(cosines, waves), focal_z, np.repeat(self.waves, places * count))
-        point = point + even - self._point_of(leaves)
-        apart = (even - point) / self.model.domain.pupil_radius_mm
-        even = point + (even - point) / np.maximum(1, np.hypot(*apart) / _ASTRAY)
-        out, plane = self.rays(np.tile(point, waves), *many), self.rays(np.tile(even, waves), *many)
-        ahead = np.concatenate([even - each(place), np.full((1, len(near)), focal_z - film_z)])
+        met, left = np.split(self._point_of(np.concatenate([way, leaves], 1)), 2, 1)
+        led, many = point + met - left, (np.tile(cosines, waves), focal_z, np.repeat(self.waves, places * count))
+        apart = (met - led) / self.model.domain.pupil_radius_mm
+        even = led + (met - led) / np.maximum(1, np.hypot(*apart) / _ASTRAY)
+        out, plane = self.rays(np.tile(led, waves), *many), self.rays(np.tile(even, waves), *many)
+        ahead = np.concatenate([even - each(place), np.full((1, even.shape[1]), focal_z - film_z)])
         shift = -(light * ahead).sum(0) + (0 if source is None else (source * way).sum(0))
         (foot, _, _), (beside, leaves, _) = (foot_of(self.core, some["ray"]) for some in (out, plane))
         aside, along = np.tile(way - direction_at(self.core, even), waves), np.tile(way, waves)
         longer = (beside * aside + (beside - foot) * (leaves - along) / 2).sum(0)
         wave = plane["path_um"] / 1000 + np.tile(shift, waves) - longer
-        passed = self._passes(out, np.tile(point + slope * back, waves), _BEYOND * stop_mm, _BEYOND**2 - 1)
-        # The wavelengths have rays in the same directions, so that one design fits them all.
+        # Far outside its widest stop a model may fold: rays from there come back into it. All wavelengths have rays in
+        # the same directions, so that one design fits them all.
+        wide = max(stop_mm, self.model.domain.stop_radius_mm / _BEYOND)
+        passed = self._passes(out, np.tile(led + slope * back, waves), _BEYOND * wide, _BEYOND**2 - 1)
+        near = self._passes(first, point + slope * back, _NEAR * wide, _NEAR**2 - 1)
         near &= (passed & np.isfinite(wave[0])).reshape(waves, -1).all(0)
         crossed, energy = self._across(foot, np.tile(axis, waves), None if source is None else np.tile(source, waves))
-        gates = out.get("gates", np.zeros((0, foot.shape[1]))) + _RIM
-        at = [*out["stop"], *np.tile(stop, waves), *np.stack([gates, 0 * gates], 1).reshape(-1, foot.shape[1])]
-        rows = np.concatenate([wave, out["power"] * energy, crossed, at]).reshape(-1, waves, places, count)
-        limits = np.array([stop_mm, _ASIDE * stop_mm, *[_RIM] * len(gates)])
+        gates = np.stack([g := out.get("gates", np.zeros((0, foot.shape[1]))) + _RIM, 0 * g], 1)
+        # The ellipse is a rim, too: beyond it polynomials may come back into the stop.
+        rows = np.concatenate(
+            [
+                wave,
+                out["power"] * energy,
+                crossed,
+                out["stop"],
+                np.tile(_spirals(count), places * waves),
+                gates.reshape(-1, foot.shape[1]),
+            ]
+        )
+        limits = np.array([stop_mm, 0.99 * _ELLIPSE, *[_RIM] * len(gates)])
         found = list[list[ExitPupil | None]]()
         for k, shows in enumerate(near.reshape(places, count)):
-            aperture, box = self.scene.lens.aperture, (place[:, k], middle[:, k], half[:, k])
-            made = fitted_waves(aperture, self.waves, box, _SQUARE, shows, rows[:, :, k], limits) if lit[k] else None
+            if lit[k] and shows.sum() < _ENOUGH and count == _FEW:
+                found += self.pupils(place[:, k : k + 1], _MANY)
+                continue
+            made = lit[k] and fitted_waves(
+                self.scene.lens.aperture, self.waves, (place[:, k], middle[:, k], half[:, k]), points[k], shows,
+                rows.reshape(-1, waves, places, count)[:, :, k], limits,
+            )  # fmt: skip
             found.append(made or [None] * waves)
         return found
 
@@ -193,47 +217,59 @@ class _Known:
         """Return the slopes [2, P] of film places' rays through the middle of the stop, and their scene rays [6, P]."""
         radius = np.hypot(*place)
         along = np.where(radius > 0, place / np.where(radius > 0, radius, 1.0), np.array([[1.0], [0.0]]))
-        back, every = self.model.domain.pupil_z_mm - self.scene.film_z_mm, np.arange(len(radius))
-        high = np.full(len(radius), self.model.domain.pupil_radius_mm)
-        low, ways = -high, np.repeat(along, _SEARCH, 1)
+        ways, back = np.repeat(along, _SEARCH, 1), self.model.domain.pupil_z_mm - self.scene.film_z_mm
+        every, ends = np.arange(len(radius)), np.outer([-1, 1], np.full(len(radius), self.model.domain.pupil_radius_mm))
         for _ in range(_ROUNDS):
-            tried = np.linspace(low, high, _SEARCH, axis=-1)
+            tried = np.linspace(ends[0], ends[1], _SEARCH, axis=-1)
             slope = (tried - radius[:, None]) / back
             cosines = ways * (slope / np.sqrt(1 + slope * slope)).reshape(-1)
             out = self.rays(np.repeat(place, _SEARCH, 1), cosines, self.scene.film_z_mm, self.waves[0])
             best = np.abs((ways * out["stop"]).sum(0)).reshape(slope.shape).argmin(1)
-            low, high = (tried[every, np.clip(best + k, 0, _SEARCH - 1)] for k in (-1, 1))
+            ends = tried[every, np.clip(best + [[-1], [1]], 0, _SEARCH - 1)]
         return along * slope[every, best], out["ray"].reshape(6, *slope.shape)[:, every, best]
 
     def _source(self, seen: Array) -> Array | None:
         """Return the object points [3, P] on chief rays [6, P], from the front focal point; None for distant ones."""
         back = np.concatenate([seen[:3], -seen[3:]])  # light travels to the film
         found = self.scene.object_points(Rays(*torch.from_numpy(back)))
-        return None if found is None else np.stack([c.numpy() for c in found]) - self.front[:, None]
+        return (
+            None
+            if found is None
+            else np.stack([c.numpy() for c in found]) - np.array([[0], [0], [self.core.front_z_mm]])
+        )
 
-    def _box(self, place: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return middles and half sides [2, P] of boxes of cosines that hold the light, and which places have any."""
+    def _box(self, place: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Return boxes of cosines about the ellipses that hold the light, and which places have any.
+
+        They are middles and half sides [2, P], and the correlation of x and y in the ellipses [P].
+        """
         domain, lens, film_z = self.model.domain, self.scene.lens, self.scene.film_z_mm
         low, high = (np.full(place.shape, sign * domain.pupil_radius_mm) for sign in (-1, 1))
-        share = (np.stack(np.meshgrid(_LINE, _LINE)).reshape(2, 1, -1) + 1) / 2
+        share = np.stack(np.meshgrid(*[np.linspace(0, 1, _RAYS)] * 2)).reshape(2, 1, -1)
         for _ in range(2):
             pupil = low[..., None] + (high - low)[..., None] * share
             slope = (pupil - place[..., None]) / (domain.pupil_z_mm - film_z)
             cosines = slope / np.sqrt(1 + (slope * slope).sum(0))
             rays = (np.repeat(place, share.shape[2], 1), cosines.reshape(2, -1), film_z, self.waves[0])
             lit = self._passes(self.rays(*rays), pupil.reshape(2, -1), lens.stop_radius_mm).reshape(pupil.shape[1:])
-            seen, step = np.asarray(lit.any(1)), (high - low) / (_RAYS - 1)
-            low, high = _ends(pupil, lit, seen)
-            low, high = low - step, high + step
-        # The edges lie between rays, half a step beyond the last that pass.
-        first, last = _ends(cosines, lit, seen)
-        return (first + last) / 2, _ROOM * (last - first) / 2 * (1 + 1 / (_RAYS - 3)), seen
+            step, count = (high - low) / (_RAYS - 1), np.maximum(lit.sum(1), 1)
+            ends = np.where(lit, pupil, np.inf).min(-1) - step, np.where(lit, pupil, -np.inf).max(-1) + step
+            low, high = (np.where(lit.any(1), end, 0.0) for end in ends)
+        middle = np.where(lit, cosines, 0.0).sum(-1) / count
+        apart = np.where(lit, cosines - middle[..., None], 0.0)
+        half = 2 * np.sqrt((apart * apart).sum(-1) / count).clip(1e-9)  # an ellipse has four times its variance
+        x, y = apart / half[..., None]
+        lean = np.rint((4 * (x * y).sum(-1) / count).clip(-0.9, 0.9) * _LEANS) / _LEANS
+        reach = np.sqrt((x * x + y * y - 2 * lean[:, None] * x * y).max(1) / (1 - lean * lean))
+        return middle, _ROOM * half * reach, lean, np.asarray(lit.any(1))
 
     def _passes(self, out: dict[str, Array], pupil: Array, stop_mm: float, gate: float = 0.0) -> NDArray[np.bool_]:
         """Return which rays [N] pass: only rays through the domain's pupil can, for a model knows no others."""
-        lit = (out["stop"] ** 2).sum(0) <= stop_mm**2
-        lit &= (pupil * pupil).sum(0) <= (self.model.domain.pupil_radius_mm * DOMAIN_SLACK) ** 2
-        return np.asarray(lit & (out.get("gates", np.zeros((1, 1))) <= gate).all(0))
+        return np.asarray(
+            ((pupil * pupil).sum(0) <= (self.model.domain.pupil_radius_mm * DOMAIN_SLACK) ** 2)
+            & ((out["stop"] ** 2).sum(0) <= stop_mm**2)
+            & (out.get("gates", np.zeros((1, 1))) <= gate).all(0)
+        )
 
     def _point_of(self, direction: Array) -> Array:
         """Return the points P [2, N] of the focal plane whose directions s(P) are these [3, N]."""
@@ -261,9 +297,3 @@ class _Known:
         met = foot - way * ((axis * foot).sum(0) / (axis * way).sum(0))
         away = source - met
         return (across * met).sum(1), (axis * away).sum(0) / np.linalg.norm(away, axis=0) ** 3
-
-
-def _ends(values: Array, lit: NDArray[np.bool_], seen: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the least and largest values [2, P] of [2, P, N] that are lit [P, N]; 0 where none is seen."""
-    ends = np.where(lit, values, np.inf).min(-1), np.where(lit, values, -np.inf).max(-1)
-    return np.where(seen, ends[0], 0.0), np.where(seen, ends[1], 0.0)

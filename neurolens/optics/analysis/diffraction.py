@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ Field = NDArray[np.complex64]
 _RAYS = 36  # rays along a side of the rectangle about what is lit
 _WIDER = 1.1  # the rectangle over what is lit
 _PER_CYCLE = 2.5  # cells a cycle of the field needs
-_FEWEST, FINEST = 80, 512  # cells across the pupil: the edges need so many even in focus
+_FEWEST, FINEST = 64, 512  # cells across the pupil: the edges need so many even in focus
 _AT_ONCE = 2**17  # cells whose waves are summed in one go
 _RINGS = 6  # radii of the Airy disc that a window has at least
 _MOST_CELLS = 1024  # of the pupil along a side, whose rays are counted
@@ -134,7 +135,7 @@ def pupils_at(scene: Scene, places_mm: Array, wavelengths_nm: Sequence[float]) -
 def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
     """Return the fewest cells across the pupil that resolve its diffraction out to `reach_mm` from the centre."""
     cycles = 2 * float(pupil.half.max()) * (reach_mm + pupil.blur_mm) / (pupil.wavelength_nm * 1e-6)
-    return max(_FEWEST, 16 * math.ceil(_PER_CYCLE * cycles / 16))
+    return max(_FEWEST, 8 * math.ceil(_PER_CYCLE * cycles / 8))
 
 
 def reach_of(pupils: Sequence[ExitPupil | None]) -> float:
@@ -197,29 +198,45 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
 
 
 def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, field: Field) -> Array:
-    """Return the irradiance [Y, X] at places from the pupil's centre, for 1 at the lens, by its `cells_of`."""
-    return irradiances([pupil], x_mm[None], y_mm[None], field[None])[0]
+    """Return the irradiance [Y, X] at places from the pupil's centre, for 1 at the lens, by its `cells_of`.
+
+    Places lie evenly on lines.
+    """
+    return irradiances([pupil], x_mm[None], y_mm[None], field[None])[0].astype(np.float64)
 
 
-def irradiances(pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, fields: Field) -> Array:
+def irradiances(pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, fields: Field) -> NDArray[np.float32]:
     """Return what `irradiance` does, [W, Y, X], for pupils with places [W, X], [W, Y] and fields [W, cells, cells]."""
-    cells = fields.shape[1]
     wave, half = np.array([p.wavelength_nm * 1e-6 for p in pupils]), np.array([p.half for p in pupils])
-    x, y = (
-        phasor((h / wave)[:, None, None] * place[..., None] * middles(cells))
-        for h, place in zip(half.T, (x_mm, y_mm), strict=True)
-    )
-    found = y @ (x @ fields).transpose(0, 2, 1)
-    scale = ((2 * half / cells).prod(1) / wave) ** 2
-    return np.asarray((found.real**2 + found.imag**2) * scale[:, None, None])
+    x, y = (size[:, None] * place for size, place in zip((half / wave[:, None]).T, (x_mm, y_mm), strict=True))
+    found = _transformed(_transformed(fields, x).swapaxes(1, 2), y)
+    scale = ((2 * half / fields.shape[1]).prod(1) / wave) ** 2
+    return np.asarray((found.real**2 + found.imag**2) * scale.astype(np.float32)[:, None, None])
+
+
+def _transformed(fields: Field, cycles: Array) -> Field:
+    """Return sums [W, X, N] of fields [W, cells, N] times waves that have so many cycles [W, X] on half the cells.
+
+    Places and cells lie evenly about their middles, so that cosines and sines of a quarter of them serve all: times the
+    parts of the fields that are even and odd about the middle.
+    """
+    count, places = fields.shape[1] // 2, cycles.shape[1]
+    middle, line = cycles[:, [0, -1]].mean(1, keepdims=True), middles(2 * count)[count:]
+    high, low = fields[:, count:], fields[:, :count][:, ::-1]
+    turn = phasor(middle * line)[..., None]
+    high, low = high * turn, low * turn.conj()
+    turn = phasor((cycles - middle)[:, places // 2 :, None] * line)
+    even = (turn.real.copy() @ np.add(high, low, order="C").view(np.float32)).view(np.complex64)
+    odd = (turn.imag.copy() @ np.subtract(high, low, order="C").view(np.float32)).view(np.complex64) * np.complex64(1j)
+    return np.concatenate([(even - odd)[:, ::-1][:, : places // 2], even + odd], 1)
 
 
 def waves_of(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the wavefronts in waves and the light per area of cosines (mm^2) in cells, [W, cells, cells]."""
-    figures = np.stack([np.moveaxis(p.figures[..., :2], -1, 0) for p in pupils])
-    figures[:, 0] *= np.array([1e6 / p.wavelength_nm for p in pupils])[:, None, None]
+    figures = np.array([p.figures[..., :2] for p in pupils]).transpose(3, 0, 1, 2)
+    figures[0] *= np.array([1e6 / p.wavelength_nm for p in pupils])[:, None, None]
     # Sums of waves have at most some 100 waves, of which float32 leaves 1e-5.
-    cycles, light = summed(figures.astype(np.float32), (middles(cells),) * 2).swapaxes(0, 1)
+    cycles, light = summed(figures.astype(np.float32), (middles(cells),) * 2)
     return cycles, np.maximum(light, 0)
 
 
@@ -243,26 +260,35 @@ def by_pixel(pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, pixel_mm: fl
     """Return the light [W, Y, X] on square pixels about places, as in `irradiances`, for 1 at the lens, in mm^2."""
     # The square of a field is as fine as lambda over the width of the pupil; two samples of that in each pixel.
     parts = max(math.ceil(4e6 * float(p.half.max()) * pixel_mm / p.wavelength_nm) for p in pupils)
-    step = pixel_mm / parts
-    x, y = (p[:, :1] + (np.arange(-1, parts * p.shape[1] + 1) - (parts - 1) / 2) * step for p in (x_mm, y_mm))
-    fine = irradiances(pupils, x, y, fields)
-    for _ in range(2):  # the mean over a sample's width, f + f'' / 24
-        fine = ((22 * fine[:, 1:-1] + fine[:, :-2] + fine[:, 2:]) / 24).swapaxes(1, 2)
-    mean = fine.reshape(len(fine), y_mm.shape[1], parts, x_mm.shape[1], parts).mean((2, 4))
-    return np.asarray(mean * pixel_mm**2, np.float64)
+    across, down = (_means(p.shape[1], parts) for p in (x_mm, y_mm))
+    x, y = (
+        p[:, [0, -1]].mean(1, keepdims=True) + (np.arange(n) - (n - 1) / 2) * pixel_mm / parts
+        for p, n in ((x_mm, across.shape[1]), (y_mm, down.shape[1]))
+    )
+    return np.asarray(down @ irradiances(pupils, x, y, fields) @ across.T * pixel_mm**2, np.float64)
+
+
+@lru_cache(maxsize=16)
+def _means(count: int, parts: int) -> NDArray[np.float32]:
+    """Return what samples weigh [count, N] in the means over pixels of so many parts; one more lies on either side."""
+    every, pixels = count * parts, np.kron(np.eye(count), np.full(parts, 1 / parts))
+    # Over a sample's width the mean is f + f'' / 24.
+    means = sum(np.eye(every, every + 2, k) * share / 24 for k, share in enumerate((1, 22, 1)))
+    return np.asarray(pixels @ means, np.float32)
 
 
 def _by_rays(
     pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, pixel_mm: float, light: Array, fold: int
 ) -> Array:  # fmt: skip
     """Return the light [W, Y, X] of rays by pixel, one for `fold` by `fold` cells, whose light is [W, cells, cells]."""
-    count, rows, columns = len(pupils), y_mm.shape[1], x_mm.shape[1]
-    cells = light.shape[1] // fold
+    count, rows, columns, cells = len(pupils), y_mm.shape[1], x_mm.shape[1], light.shape[1] // fold
     light = light.reshape(count, cells, fold, cells, fold).sum((2, 4))
     hits = summed(slopes(pupils).astype(np.float32), (middles(cells),) * 2)
-    at = np.stack([x_mm[:, 0], y_mm[:, 0]], 1)[..., None, None]
-    column, row = np.floor((hits - at) / pixel_mm + 0.5).astype(np.int32).swapaxes(0, 1)
+    column, row = (
+        np.floor((hits - np.array([x_mm[:, 0], y_mm[:, 0]], np.float32).T[..., None, None]) / pixel_mm + 0.5)
+        .astype(np.int32)
+        .swapaxes(0, 1)
+    )
     met = (column >= 0) & (column < columns) & (row >= 0) & (row < rows) & (light > 0)
     place = (np.arange(count)[:, None, None] * rows + row) * columns + column
-    found = np.bincount(place[met], light[met], count * rows * columns)
-    return np.asarray(found.reshape(count, rows, columns), np.float64)
+    return np.asarray(np.bincount(place[met], light[met], count * rows * columns).reshape(count, rows, columns))

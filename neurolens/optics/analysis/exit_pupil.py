@@ -31,9 +31,16 @@ Array = NDArray[np.floating[Any]]
 _DEGREE = 14  # of the polynomials
 _FEWEST = 240  # the fewest rays for their 120 terms
 _BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
-_PARTS = 6  # of a cell along its side, where an edge crosses it
+# Slopes of Chebyshev series from the series.
+_STEEP = np.pad(chebyshev.chebder(np.eye(_DEGREE + 1)), [(0, 1), (0, 0)])
+# Cells that an edge crosses have so many parts along a side. By parts: shares of the four corners of the cell, and what
+# three middles about it, and nine, weigh in a sum.
+_PARTS = 6
+_PART = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5).astype(np.float32)
+_WAYS = np.stack([np.outer(a, b).reshape(-1) for b in (0.5 - _PART, 0.5 + _PART) for a in (0.5 - _PART, 0.5 + _PART)])
+_NEAR = np.stack([_PART * (_PART - 1) / 2, 1 - _PART**2, _PART * (_PART + 1) / 2])
+_MOMENTS = np.einsum("ap,bq->pqab", _NEAR, _NEAR).reshape(-1, 9) / _PARTS**2
 _ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
-_ELLIPSE = 0.96  # the part of a box's ellipse in which all rays of a model count, where no rim cuts them
 _FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
 
 
@@ -71,7 +78,10 @@ class ExitPupil:
 
     def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
         """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
-        return _lets(self.aperture, np.array([self.limits_mm]), self._at(places, slice(2, None))[None])[0]
+        at = self._at(places, slice(2, None))
+        return _lets(
+            self.aperture, np.array(self.limits_mm)[:, None], at.reshape(len(self.limits_mm), 2, 1, *at.shape[1:])
+        )[0]
 
     def open_share(self, cells: int) -> Array:
         """Return the share [cells, cells] of each cell of the box that light passes, as `open_shares`."""
@@ -108,10 +118,8 @@ def summed(figures: Array, places: Array | tuple[Array, Array]) -> Array:
 
 def slopes(pupils: Sequence[ExitPupil]) -> Array:
     """Return the series [W, 2, D, D] of where the rays of pupils meet the film, in mm from their centres."""
-    wave = np.stack([p.figures[..., 0] for p in pupils], -1)
-    by_u, by_v = (chebyshev.chebder(wave, axis=k) for k in (0, 1))
-    both = np.stack([np.pad(by_u, ((0, 1), (0, 0), (0, 0))), np.pad(by_v, ((0, 0), (0, 1), (0, 0)))])
-    return -both.transpose(3, 0, 1, 2) / np.array([p.half for p in pupils])[..., None, None]
+    wave = np.stack([p.figures[..., 0] for p in pupils])
+    return -np.stack([_STEEP @ wave, wave @ _STEEP.T], 1) / np.array([p.half for p in pupils])[..., None, None]
 
 
 def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -122,51 +130,42 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     error four times as large on 160 cells across as these do on 80. Cells on an edge are divided; places at the rims
     are linear between their corners.
     """
-    rims, aperture = max(len(p.limits_mm) for p in pupils), pupils[0].aperture
+    aperture, rims = pupils[0].aperture, np.arange(max(len(p.limits_mm) for p in pupils))
     # The stop, which comes first, stands again for rims that only other wavelengths have.
-    kept = [[*range(len(p.limits_mm)), *[0] * (rims - len(p.limits_mm))] for p in pupils]
-    limits = np.array([np.array(p.limits_mm)[k] for p, k in zip(pupils, kept, strict=True)])
-    rows = [p.figures[..., 2:].reshape(*p.figures.shape[:2], -1, 2)[:, :, k] for p, k in zip(pupils, kept, strict=True)]
-    figures = np.stack(rows).reshape(len(pupils), *rows[0].shape[:2], -1).transpose(0, 3, 1, 2).astype(np.float32)
-    at = summed(figures, (np.linspace(-1, 1, cells + 1),) * 2)
-    lit = _lets(aperture, limits, at).view(np.int8)
-    count = lit[:, :-1] + lit[:, 1:]
+    kept = [rims * (rims < len(p.limits_mm)) for p in pupils]
+    limits = np.array([np.array(p.limits_mm)[k] for p, k in zip(pupils, kept, strict=True)]).T
+    figures = [p.figures[..., 2 + 2 * k[:, None] + [0, 1]] for p, k in zip(pupils, kept, strict=True)]
+    series = np.array(figures, np.float32).transpose(3, 4, 0, 1, 2)
+    at = summed(series, (np.linspace(-1, 1, cells + 1),) * 2)
+    count = _lets(aperture, limits, at).view(np.int8)
+    count = count[:, :-1] + count[:, 1:]
     count = count[:, :, :-1] + count[:, :, 1:]
-    w, i, j = edge = np.nonzero((count > 0) & (count < 4))
-    part = (np.arange(_PARTS) + 0.5) / _PARTS
-    ways = np.stack([np.outer(a, b).reshape(-1) for b in (1 - part, part) for a in (1 - part, part)]).astype(np.float32)
-    ends = np.stack([at[w, :, i, j], at[w, :, i + 1, j], at[w, :, i, j + 1], at[w, :, i + 1, j + 1]], -1)
-    parts = (ends.reshape(-1, 4) @ ways).reshape(*ends.shape[:2], -1)  # one product of matrices, not one for each edge
-    inside = _lets(aperture, limits[w], parts).astype(np.float32)
+    w, i, j = edge = np.nonzero(count & 3)  # some of the four corners are lit, not all
+    corner = (w * (cells + 1) + i) * (cells + 1) + j
+    ends = at.reshape(*at.shape[:2], -1)[..., corner[:, None] + [0, cells + 1, 1, cells + 2]]
+    inside = _lets(aperture, limits[:, w], ends @ _WAYS).astype(np.float32)
     whole = (count == 4).astype(np.float32)
-    t = part - 0.5
-    near = np.stack([t * (t - 1) / 2, 1 - t * t, t * (t + 1) / 2])
-    weight = np.pad(whole, ((0, 0), (1, 1), (1, 1)))
-    for axis in (1, 2):
-        beside = np.roll(weight, 1, axis) + np.roll(weight, -1, axis)
-        weight += np.float32(near[0].mean()) * (beside - 2 * weight)
-    given = inside @ (np.einsum("ap,bq->pqab", near, near).reshape(-1, 9) / _PARTS**2).astype(np.float32)
-    place = np.ravel_multi_index((w, i, j), weight.shape)[:, None] + np.add.outer(
-        np.arange(3) * (cells + 2), np.arange(3)
-    ).reshape(-1)
-    weight += np.bincount(place.reshape(-1), given.reshape(-1), weight.size).reshape(weight.shape)
+    shape, aside = (len(pupils), cells + 2, cells + 2), np.outer(np.arange(3) * (cells + 2), [1, 1, 1]) + np.arange(3)
+    place = np.ravel_multi_index(edge, shape)[:, None] + aside.reshape(-1)
+    given = np.bincount(place.reshape(-1), (inside @ _MOMENTS).reshape(-1), math.prod(shape)).reshape(shape)
+    smooth = sum(np.eye(cells, k=k, dtype=np.float32) * m for k, m in zip((-1, 0, 1), _NEAR.mean(1), strict=True))
+    weight = smooth @ whole @ smooth + given[:, 1:-1, 1:-1]
     whole[edge] = inside.mean(-1)
-    return whole, np.asarray(weight[:, 1:-1, 1:-1], np.float32)
+    return whole, np.asarray(weight, np.float32)
 
 
 def _lets(aperture: Aperture | None, limits_mm: Array, at: Array) -> NDArray[np.bool_]:
-    """Return whether light passes [W, ...], from rims' radii [W, K] and its places at them [W, 2 K, ...]."""
-    squares = at * at
-    apart = limits_mm.astype(at.dtype).reshape(*limits_mm.shape, *[1] * (at.ndim - 2)) ** 2
-    inside = np.asarray((squares[:, ::2] + squares[:, 1::2] <= apart).all(1))
+    """Return whether light passes [W, ...], from rims' radii [K, W] and its places at them [K, 2, W, ...]."""
+    apart = limits_mm.astype(at.dtype).reshape(*limits_mm.shape, *[1] * (at.ndim - 3)) ** 2
+    inside = np.asarray((at[:, 0] ** 2 + at[:, 1] ** 2 <= apart).all(0))
     if aperture is not None:
-        inside[inside] = aperture.inside(at[:, 0][inside], at[:, 1][inside], float(limits_mm[0, 0]))
+        inside[inside] = aperture.inside(at[0, 0][inside], at[0, 1][inside], float(limits_mm[0, 0]))
     return inside
 
 
 def phasor(cycles: Array, amplitude: Array | float = 1.0) -> NDArray[np.complex64]:
     """Return amplitude exp(2 pi i cycles): parts of a cycle are taken before they are rounded."""
-    angle = ((cycles - np.rint(cycles)) * (2 * math.pi)).astype(np.float32)
+    angle = ((cycles - np.rint(cycles)) * (2 * math.pi)).astype(np.float32, copy=False)
     found = np.empty(angle.shape, np.complex64)
     found.real, found.imag = np.cos(angle) * amplitude, np.sin(angle) * amplitude
     return found
@@ -237,8 +236,9 @@ def fitted_pupil(
     design = _design(np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None]).tobytes())
     along = np.concatenate([by / side for by, side in zip(design.slopes, half, strict=True)])
     wave = _least(along[:, 1:])(-(rays.hits[:, near] - centre[:, None]).reshape(-1))
-    rows = [(rays.power * energy)[near], *places[:, near], *rays.at[cut][..., near].reshape(2 * len(cut), -1)]
-    figures = _fitted(design, half, wave[:, None], np.array(rows)[:, None])[0]
+    at, power = rays.at[cut][..., near].reshape(2 * len(cut), -1), (rays.power * energy)[near]
+    figures = _fitted(design, half, np.array([0 * power, power, *places[:, near], *at])[:, None])[0]
+    figures[_I, _J, 0] = [0, *wave]
     through = inside.copy()
     if aperture is not None:
         through &= aperture.inside(rays.at[rays.stop, 0], rays.at[rays.stop, 1], float(limits[rays.stop]))
@@ -261,85 +261,78 @@ def fitted_waves(
         rows: [R, W, N] the wavefront (mm) about the place, light per area, x and y on a surface before the lens, then x
             and y in mm at the stop and at the rims, whose radii are `limits_mm`.
     """
-    part = np.hypot(rows[4::2], rows[5::2]) / limits_mm[:, None, None]
+    part = (rows[4::2] ** 2 + rows[5::2] ** 2) / limits_mm[:, None, None] ** 2
     inside = near & (part.max(0) <= 1)
     if inside.sum(1).min() < 16 or near.sum() < _FEWEST:
         return None
-    # Most pupils fill an ellipse in their boxes, so that one design fits them all.
-    round_ = (points * points).sum(0) <= _ELLIPSE**2
-    used = round_ if near[round_].all() and not inside[:, ~round_].any() else near
     place, middle, half = box
-    cut = [k for k in range(len(limits_mm)) if k == 0 or part[k][:, used].max() > 1]
-    kept = [0, 1, 2, 3, *(4 + 2 * k + way for k in cut for way in (0, 1))]
-    design = _design(points[:, used].tobytes())
-    rows = rows[:, :, used]
-    wave = design.solved(rows[0].T)
-    hits = -np.stack([by @ wave / side for by, side in zip(design.slopes, half, strict=True)])
-    figures = _fitted(design, half, wave[1:], rows[kept[1:]])
+    cut = [k for k in range(len(limits_mm)) if k == 0 or part[k][:, near].max() > 1]
+    kept = [*range(4), *(4 + 2 * k + way for k in cut for way in (0, 1))]
+    design = _common(points.tobytes()) if near.all() else _design(points[:, near].tobytes())
+    rows, inside = rows[kept][:, :, near], inside[:, near]
+    rows[0] -= rows[0, :, :1]  # paths are long
+    if aperture is not None:
+        left = inside & aperture.inside(rows[4], rows[5], float(limits_mm[0]))
+        inside = np.where(left.any(1, keepdims=True), left, inside)
+    figures = _fitted(design, half, rows)
+    every = -(design.slopes @ figures[:, _I, _J, 0].T / half[:, None, None]).transpose(2, 0, 1)
     found = list[ExitPupil | None]()
-    for k, nm in enumerate(wavelengths_nm):
-        through = inside[k, used]
-        if aperture is not None:
-            left = through & aperture.inside(rows[4, k], rows[5, k], float(limits_mm[0]))
-            through = left if left.any() else through
-        own = hits[:, through, k]
-        centre = own.mean(1)
-        figures[k, 1, 0, 0], figures[k, 0, 1, 0] = (figures[k, 1, 0, 0], figures[k, 0, 1, 0]) + half * centre
-        found.append(
-            ExitPupil(
-                nm, place + centre, middle, half, figures[k], tuple(limits_mm[cut]), aperture, own - centre[:, None],
-                np.zeros((2, 2)),
-            )
-        )  # fmt: skip
+    for nm, hits, own, through in zip(wavelengths_nm, every, figures, inside, strict=True):
+        hits = hits[:, through]
+        centre = hits.mean(1)
+        own[[1, 0], [0, 1], 0] += half * centre
+        at, limits, hits = place + centre, tuple(limits_mm[cut]), hits - centre[:, None]
+        found.append(ExitPupil(nm, at, middle, half, own, limits, aperture, hits, np.zeros((2, 2))))
     return found
 
 
-def _fitted(design: _Design, half: Array, wave: Array, rows: Array) -> Array:
+def _fitted(design: _Design, half: Array, rows: Array) -> Array:
     """Return `ExitPupil.figures` [W, D, D, K] by least squares to rays at points of the box.
 
     The light per area of cosines has the derivatives of the points on the disc.
 
     Args:
-        wave: [M - 1, W] coefficients of the wavefront, but the first.
-        rows: [R, W, N] power, x and y on the disc, x and y at rims.
+        rows: [R, W, N] the wavefront, power, x and y on the disc, x and y at rims.
     """
-    (by_u, by_v), waves = design.slopes, wave.shape[1]
-    mapped = design.solved(rows[1:3].reshape(2 * waves, -1).T)
-    (au, bu), (av, bv) = (
-        (by @ mapped).T.reshape(2, waves, -1) / side for by, side in zip((by_u, by_v), half, strict=True)
-    )
-    light = (rows[0] * np.abs(au * bv - av * bu))[None]
-    rest = design.solved(np.concatenate([light, rows[3:]]).reshape(-1, light.shape[2]).T)
-    figures = np.zeros((waves, _DEGREE + 1, _DEGREE + 1, len(rows) - 1))
-    i, j = _ORDERS
-    figures[:, i[1:], j[1:], 0] = wave.T
-    figures[:, i, j, 1:] = rest.reshape(len(rest), -1, waves).transpose(2, 0, 1)
+    waves, count = rows.shape[1:]
+    found = design.solved(rows.reshape(-1, count).T).reshape(-1, len(rows), waves)
+    steep = design.slopes @ found[:, 2:4].reshape(len(found), -1)
+    (au, bu), (av, bv) = steep.reshape(2, count, 2, waves).transpose(0, 2, 3, 1)
+    found[:, 1] = design.solved((rows[1] * np.abs(au * bv - av * bu) / half.prod()).T)
+    figures = np.zeros((waves, _DEGREE + 1, _DEGREE + 1, len(rows) - 2))
+    figures[:, _I, _J] = found[:, [0, 1, *range(4, len(rows))]].transpose(2, 0, 1)
     return figures
 
 
 _APART = 1e-7  # the least share of the largest pivot that a sound fit has
-_ORDERS = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
+_I, _J = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)  # degrees of the terms
 
 
 class _Design(NamedTuple):
-    """Polynomials at N points: their slopes [N, M] by u and v, and the function that fits them to values."""
+    """Polynomials at N points: their slopes [2, N, M] by u and v, and the function that fits them to values."""
 
-    slopes: tuple[Array, Array]
+    slopes: Array
     solved: Callable[[Array], Array]
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=64)
+def _common(places: bytes) -> _Design:
+    """Return the design of points that many pupils have: the fit is one product of matrices."""
+    design = _design(places)
+    return design._replace(solved=design.solved(np.eye(design.slopes.shape[1])).__matmul__)
+
+
 def _design(places: bytes) -> _Design:
-    """Return the design of points [2, N], which most pupils of models have in common."""
+    """Return the design of points [2, N]."""
     # Chebyshev polynomials of each coordinate, and their slopes.
     value = [chebyshev.chebvander(p, _DEGREE) for p in np.frombuffer(places).reshape(2, -1)]
-    turn = np.pad(chebyshev.chebder(np.eye(_DEGREE + 1)), [(0, 1), (0, 0)])
-    slope = [v @ turn for v in value]
+    slope = [v @ _STEEP for v in value]
 
     def products(a: Array, b: Array) -> Array:
-        return a[:, _ORDERS[0]] * b[:, _ORDERS[1]]
+        return a[:, _I] * b[:, _J]
 
-    return _Design((products(slope[0], value[1]), products(value[0], slope[1])), _least(products(*value)))
+    slopes = np.stack([products(slope[0], value[1]), products(value[0], slope[1])])
+    return _Design(slopes, _least(products(*value)))
 
 
 def _least(a: Array) -> Callable[[Array], Array]:
