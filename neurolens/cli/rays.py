@@ -82,7 +82,12 @@ examples:
         """Return an array in a nameless file beside the output: what is made waits there, not in memory."""
         file = files.enter_context(tempfile.TemporaryFile(dir=self.out.parent))
         if hasattr(os, "posix_fallocate"):  # else a full disk would end the process, not the command
-            os.posix_fallocate(file.fileno(), 0, max(1, math.prod(shape) * np.dtype(kind).itemsize))
+            size = max(1, math.prod(shape) * np.dtype(kind).itemsize)
+            try:
+                os.posix_fallocate(file.fileno(), 0, size)
+            except OSError as error:
+                needed = f"{error.strerror}, for {size / 1e9:.3g} GB that wait in its folder"
+                raise OSError(error.errno, needed, str(self.out)) from None
         return np.memmap(file, kind, "w+", shape=shape)
 
     def _writer(self) -> Callable[[Path, Arrays, dict[str, Any]], None]:

@@ -228,16 +228,20 @@ def rays(
         film = check_film(film)
     except (TypeError, InputError):
         raise InputError("rays", "film", film, f"a width and a height, each {said(FILM_MM)} mm") from None
+    if device is not None:
+        import torch
+
+        try:
+            torch.empty(0, device=device)
+        except (TypeError, RuntimeError, AssertionError) as error:
+            said_so = str(error).partition("\n")[0]
+            raise InputError("rays", "device", str(device), f"a device that torch has here ({said_so})") from None
     grid = PixelGrid(*size_by_shape(film[0] / film[1], width, height), film)
     check_memory(grid.width, grid.height, BYTES_A_RAY * asked.samples)
     shot = Shot.part(**{"film_mm": film, "wavelength_nm": asked.light_nm} | settings)
     made = make_camera(os.fspath(camera), shot)
     found: dict[str, Any] = RayJob(made, grid, asked, focus_m(made, shot)).arrays()
-    if device is None:
-        return found
-    import torch
-
-    return {name: torch.from_numpy(array).to(device) for name, array in found.items()}
+    return found if device is None else {name: torch.from_numpy(a).to(device) for name, a in found.items()}
 
 
 class RayJob:

@@ -1,6 +1,9 @@
 """Rays of `neurolens rays`: the frames of the hosts by their own pinholes, weights, samples, files, and mistakes."""
 
+import errno
 import math
+import os
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -291,6 +294,19 @@ def test_safetensors_hold_the_same(capsys: pytest.CaptureFixture[str], tmp_path:
         np.testing.assert_array_equal(found[name], array)
 
 
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="files cannot be given their room here")
+def test_a_full_disk_is_named_with_what_it_lacks(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(file: int, start: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    said = failure(capsys, *LINE, "-o", tmp_path / "rays.npz")
+    assert re.search(rf"{tmp_path}/rays\.npz: No space left on device, for \d\S* GB", said)
+    assert not list(tmp_path.iterdir())
+
+
 def test_mistakes_are_one_line_and_leave_nothing(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / "rays.npz"
     for words, said in (
@@ -310,6 +326,7 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys: pytest.CaptureFixture[s
     for settings, said in (
         ({"focus": 2.0}, "rays: focus: got 2.0, expected one of: .*focus_m"),
         ({"to": "unity"}, "to: got 'unity', expected one of: opengl"),
+        ({"device": "nowhere"}, "device: got 'nowhere', expected a device that torch has here"),
         ({"samples": 1 << 16, "width": 16384, "height": 10923}, "of .* GB"),
         ({"width": None}, "width or height"),
         ({"width": 4.5}, "width: got 4.5, expected an integer"),
