@@ -38,7 +38,7 @@ class Blur:
         vignetting: whether light falls off towards the corners as through the lens.
 
     Raises:
-        InputError: it is no such file, or has no such state.
+        InputError: it is no such file, or has no such state, or the middle of the part lies beyond its film.
     """
 
     def __init__(
@@ -48,6 +48,8 @@ class Blur:
         about, arrays = file if isinstance(file, tuple) else read_psf(Path(file))
         if not all(0 <= k < n for k, n in zip(state, arrays["psf"].shape[:2], strict=True)):
             raise InputError("blur", "state", state, f"below {arrays['psf'].shape[:2]}, the file's states")
+        if any(2 * abs(place) > side for place, side in zip(at_mm, about["film_mm"], strict=True)):
+            raise InputError("blur", "at_mm", at_mm, "a place on the film of {:g} x {:g} mm".format(*about["film_mm"]))
         kernels, pixel_mm = arrays["psf"][state].astype(np.float64), about["pixel_um"] / 1000
         self.size, self.channels, self.radius = size, kernels.shape[2], kernels.shape[-1] // 2
         whole = kernels.sum((-2, -1), keepdims=True)
@@ -103,10 +105,14 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
     its noise and its colours: [3, n, n], or [1, n, n] of a mosaic, as light (electrons over those of value 1).
 
     Attributes:
-        pictures: files (.exr, or .png and .jpg as sRGB) or arrays [H, W, 3] of linear sRGB.
+        pictures: files (.exr, or .png and .jpg as sRGB) or arrays [H, W, 3] of linear sRGB, floats whose white is 1.
         files: of `neurolens psf` with channels R, G, B.
         patch: pixels a side. sensor: None leaves light as it is. length: pairs in an epoch; None is that of pictures.
         vignetting: as of `Blur`.
+
+    Raises:
+        InputError: there is no picture or file, or a picture is none of these, or smaller than a patch.
+        IndexError: the number of a pair is not below the length.
     """
 
     pictures: Sequence[Path | str | Any]
@@ -118,6 +124,11 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
     vignetting: bool = True
 
     def __post_init__(self) -> None:
+        for name in ("pictures", "files"):
+            if isinstance(given := getattr(self, name), str | Path) or not len(given):
+                raise InputError("pairs", name, given, "a list of at least one")
+        if self.patch != int(self.patch) or self.patch < 1:
+            raise InputError("pairs", "patch", self.patch, "a whole number of pixels, at least 1")
         self._lenses = [read_psf(Path(file)) for file in self.files]
         for file, (_, arrays) in zip(self.files, self._lenses, strict=True):
             if arrays["psf"].shape[4] != 3:
@@ -128,10 +139,16 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
 
     def __getitem__(self, number: int) -> tuple[Tensor, Tensor]:
         """Return the sharp and the blurred patch of a number."""
+        if not 0 <= number < len(self):
+            raise IndexError(f"pair {number} of {len(self)}")  # which ends a loop over all
         random = np.random.default_rng([self.seed, number])
         picture = self.pictures[number % len(self.pictures)]
         if isinstance(picture, str | Path):
             picture = read_picture(Path("pairs"), "picture", Path(picture))
+        picture = np.asarray(picture)
+        if picture.shape[2:] != (3,) or picture.dtype.kind != "f":  # whole numbers, as PNG has them, are not linear
+            found = f"({picture.dtype} {picture.shape})"
+            raise InputError("pairs", "picture", found, "floats [H, W, 3] of linear sRGB, or the name of a file")
         if min(picture.shape[:2]) < self.patch:
             raise InputError("pairs", "picture", picture.shape, f"at least {self.patch} pixels a side")
         about, arrays = self._lenses[random.integers(len(self._lenses))]
@@ -146,6 +163,8 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
             for corner in (int(random.integers(size - self.patch + 1)),)
         )
         around = torch.from_numpy(picture[rows[:, None], columns].astype(np.float32).transpose(2, 0, 1).copy())
+        if not around.isfinite().all():
+            raise InputError("pairs", "picture", "(not finite)", "finite numbers")
         blur = Blur((about, arrays), (len(rows), len(columns)), (right, up), (n, d), vignetting=self.vignetting)
         sharp, blurred = (v[:, room : room + self.patch, room : room + self.patch] for v in (around, blur(around)))
         if self.sensor is None:

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -218,7 +219,34 @@ def test_pairs_have_the_blur_and_the_noise_of_the_sensor(made: Path) -> None:
         BlurredPairs([flat], [made], 96)[0]
 
 
-def test_a_state_that_is_not_there_is_refused(made: Path) -> None:
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"pictures": []}, "pictures.*at least one"),
+        ({"pictures": "a.png"}, "pictures.*a list"),
+        ({"files": "library.npz"}, "files.*a list"),
+        ({"patch": 0}, "patch.*at least 1"),
+        ({"patch": 9.5}, "patch.*whole number"),
+        ({"pictures": [np.full((40, 40, 3), 128, np.uint8)]}, "uint8.*floats"),  # sRGB, or light? nobody can tell
+        ({"pictures": [np.zeros((40, 40))]}, "float64 .40, 40.*floats"),
+        ({"pictures": [np.zeros((40, 40, 4))]}, "40, 40, 4.*floats"),
+        ({"pictures": [np.full((40, 40, 3), np.nan)]}, "not finite"),
+    ],
+)
+def test_what_gives_no_pairs_is_one_line(made: Path, wrong: dict[str, Any], said: str) -> None:
+    given: dict[str, Any] = {"pictures": [np.zeros((40, 40, 3))], "files": [made], "patch": 32}
+    with pytest.raises(InputError, match=said):
+        BlurredPairs(**(given | wrong))[0]
+
+
+def test_a_loop_over_pairs_ends_and_takes_tensors(made: Path) -> None:
+    pairs: Any = BlurredPairs([torch.full((40, 40, 3), 0.4)], [made], patch=32, length=2, vignetting=False)
+    assert [float(blurred.mean()) for _, blurred in pairs] == pytest.approx([0.4, 0.4], rel=1e-3)
+
+
+def test_a_state_or_a_place_that_is_not_there_is_refused(made: Path) -> None:
+    with pytest.raises(InputError, match="at_mm.*30 x 20 mm"):
+        Blur(made, (8, 8), at_mm=(4.0, 10.5))
     with pytest.raises(InputError, match="the file's states"):
         Blur(made, (8, 8), state=(2, 0))
     with pytest.raises(InputError, match="picture"):
