@@ -12,15 +12,16 @@ if TYPE_CHECKING:
     def _run(*given: Any, **named: Any) -> Answer: ...
 
     lens, camera = Lens.make, Camera.make
-    analyse = bokeh = defocus = export = find = flare = plan = projection = psf = render = stmap = train = verify = _run
+    analyse = bokeh = convert = copies = defocus = export = find = flare = handover = plan = projection = psf = _run
+    render = stmap = train = verify = _run
 
 __version__ = "0.1.0"
 # What pip calls this project. `neurolens` on PyPI is another one, with the same folder and command.
 DISTRIBUTION = "neurolens-camera"
 # The Python front: made by `front.of` when it is asked for.
 __all__ = [
-    "analyse", "bokeh", "camera", "defocus", "export", "find", "fit", "flare", "lens", "load", "plan", "projection",
-    "psf", "rays", "render", "stmap", "train", "verify",
+    "analyse", "bokeh", "camera", "convert", "copies", "defocus", "export", "find", "fit", "flare", "handover", "lens",
+    "load", "plan", "projection", "psf", "rays", "render", "stmap", "train", "verify",
 ]  # fmt: skip
 
 # onnxruntime reads this when it is imported. Otherwise 1.31 writes a device id and events into the user's cache folder

@@ -50,6 +50,9 @@ EXAMPLES = {  # of each name: its docstring shows it, and a test runs it
     "flare": f"nl.flare('{_LENS}', light=(15, 8), width=96, quick=True, output='flare.exr')",
     "defocus": f"nl.defocus('plate.exr', '{_LENS}.ols-36', film=(36, 24), focus_m=2, output='blurred.exr')",
     "bokeh": f"nl.bokeh('{_LENS}.ols-36', width=480, film=(36, 24), focus_m=2, distance=[1, 5], output='bokeh')",
+    "convert": f"nl.convert('{_LENS}', focal_length_mm=85, output='gauss_85.toml')",
+    "copies": f"nl.copies('{_LENS}', decentre_mm=0.1, number=2, output='copies')",
+    "handover": f"nl.handover('{_LENS}.ols-36', width=96, film=(36, 20.25), focus_m=2, output='shot')",
     "stmap": f"nl.stmap('{_LENS}.ols-36', width=480, film=(36, 20.25), focus_m=2, output='shot')",
     "projection": f"nl.projection('{_LENS}.ols-36', width=480, film=(36, 24), projection='opencv')",
     "psf": f"nl.psf('{_LENS}', film=(36, 24), pixel_um=6, grid=(3, 1), f_number=[4, 8], output='gauss.npz')",
@@ -57,6 +60,18 @@ EXAMPLES = {  # of each name: its docstring shows it, and a test runs it
     "export": f"nl.export('{_LENS}.ols-36', to='c', output='lens.h')",
     "train": f"nl.train(lens='{_LENS}', within='5um', rounds=0, output='gauss')",
 }
+
+
+_ANSWERS = """\
+Returns:
+    a dictionary, the object that --json prints, whose keys carry their unit. Its .text is what the command prints, and
+    its .rgb the picture that was written, linear [H, W, 3].
+
+Raises:
+    InputError: a value, a name or a file is not what is expected; the message says what is.
+    ModelError: a model's file cannot be trusted.
+
+"""
 
 
 class Call:
@@ -84,7 +99,7 @@ def of(name: str) -> Call:
     chosen = {"lens": Lens, "camera": Camera}.get(name)
     reads = chosen.reads if chosen else command(name)
     listed = "\n".join(f"    {key}: {action.help}" for key, action in parameters(reads)[1].items())
-    doc = f"{inspect.getdoc(chosen or reads)}\n\nParameters:\n{listed}\n\n{example}"
+    doc = f"{inspect.getdoc(chosen or reads)}\n\nParameters:\n{listed}\n\n{'' if chosen else _ANSWERS}{example}"
     return Call(name, chosen.make if chosen else partial(run_command, reads), doc, signature_of(reads))
 
 
@@ -231,12 +246,13 @@ class Lens(_Chosen):
             return focus_of(lens, self._read.state.shot())
 
     @installed()
-    def trace(self, rays: ArrayLike, wavelength_nm: float | None = None, towards: Towards = "scene") -> LensRays:
+    def trace(self, rays: ArrayLike, wavelength_nm: ArrayLike | None = None, towards: Towards = "scene") -> LensRays:
         """Trace rays through every surface; the answer has the form of a model's answer, in float64.
 
         Args:
             rays: [6, N], x, y, z in mm and the unit direction, lens frame.
-            wavelength_nm: None takes the lens's reference wavelength, which for most lenses is the d line.
+            wavelength_nm: a number, or [N], one for each ray; None takes the reference wavelength of the lens, for most
+                lenses the d line.
             towards: "scene" for camera rays, which travel towards -z, or "film".
 
         Raises:
@@ -250,8 +266,11 @@ class Lens(_Chosen):
         if (array := np.array(rays, np.float64)).ndim != 2 or len(array) != 6:
             raise InputError("Lens.trace", "rays", f"({array.shape})", "an array (6, N)")
         lens, start, stop = self.prescription, Rays(*torch.from_numpy(array)), self.prescription.stop_index
+        light: Any = None if wavelength_nm is None else np.array(wavelength_nm, np.float64)
+        if light is not None:
+            light = torch.from_numpy(light) if light.ndim else float(light)
         with self._glasses():
-            done = trace(lens, start, wavelength_nm, towards=towards, transmittance=True, record=(stop,))
+            done = trace(lens, start, light, towards=towards, transmittance=True, record=(stop,))
         crossing, through = done.crossings[stop], done.transmittance
         assert through is not None
         columns = (torch.stack(list(done.rays)), through, torch.stack([crossing.x, crossing.y]), done.status)

@@ -36,7 +36,7 @@ COMMANDS = next(a for a in build_parser()._actions if isinstance(a, _SubParsersA
 CALLS = [name for name in COMMANDS if issubclass(command(name), Reporting)]
 UNITS = "(_(mm|m|deg|nm|px|s|per_mm))?_?"  # at the end of a parameter; a word of Python has a further _
 # Examples that take more than two seconds, or that stand on the page, too.
-LONG = {"psf", "fit", "train", "plan", "verify", "bokeh", "analyse", "flare"}
+LONG = {"handover", "psf", "fit", "train", "plan", "verify", "bokeh", "analyse", "flare"}
 
 
 @pytest.fixture(autouse=True)
@@ -125,6 +125,7 @@ def test_mistakes_that_only_a_call_can_make_are_one_line() -> None:
         (lambda: nl.fit(nl.lens(GAUSS, blades=5)), "blades"),
         (lambda: nl.train(lens=[nl.lens(GAUSS, f_number=4)]), "f_number: got (unknown key)"),
         (lambda: nl.lens(GAUSS).trace(np.zeros(6)), "an array (6, N)"),
+        (lambda: nl.lens(GAUSS).trace(np.zeros((6, 3)), [500, 600]), "wavelength_nm"),
         (lambda: nl.lens("--help"), "LENS: --help"),
         (lambda: nl.analyse(GAUSS, ["--help"]), "WHAT: got '--help'"),
     ):
@@ -156,6 +157,10 @@ def test_the_figures_of_a_lens_are_those_of_its_command_and_of_its_rays() -> Non
     found = lens.trace(np.array([[0], [1e-3], [-20], [0], [0], [1.0]]), towards="film")
     assert -1e-3 * found.scene_ray[5] / found.scene_ray[4] == pytest.approx(lens.focal_length_mm, rel=1e-7)
     assert found.status == [0] and lens.trace(np.array([[0], [90], [-20], [0], [0], [1.0]])).status != [0]
+    ray, many = np.array([[0], [5.0], [-20], [0], [0], [1.0]]), [450.0, 650.0]
+    each = np.hstack([lens.trace(ray, nm, towards="film").scene_ray for nm in many])
+    assert lens.trace(np.hstack([ray, ray]), many, towards="film").scene_ray == pytest.approx(each, abs=1e-12)
+    assert np.ptp(each[1]) > 1e-3  # it disperses
     again = lens.trace([[0], [1e-3], [-20], [0], [0], [2.0]], towards="film")  # no unit vector
     assert again.status != [0]
 

@@ -145,7 +145,7 @@ ACTIONS = [["blender", "build"], ["blender", "add"]]
 def test_a_command_alone_says_what_it_does_and_gives_an_example_that_runs(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whose inputs ship or are made by the line itself; a file of another program is in a checkout alone."""
+    """Whose inputs ship or are made by the line itself."""
     with pytest.raises(SystemExit) as ended:
         main(words)
     about, example = capsys.readouterr().err.splitlines()

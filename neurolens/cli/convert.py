@@ -39,13 +39,13 @@ class Convert(cli.Reporting):
 
     epilog = """\
 examples:
+  neurolens convert leica_summilux_50mm_f1_4 --focal-length 85 -o summilux_85.toml
   neurolens convert experiments/fuzz_seeds/lens.zmx -o my_lens.toml
   neurolens convert wide.22mm.dat -o wide.toml --name "Wide angle 22 mm" --source "Smith p. 360"
-  neurolens convert triplet.seq -o triplet.toml --half-field 20 --json
-  neurolens convert lenses/leica_summilux_50mm_f1_4.toml --focal-length 85 -o summilux_85.toml"""
+  neurolens convert triplet.seq -o triplet.toml --half-field 20 --json"""
     kept = "only a finished lens file is written"
 
-    file: Path = setting(..., "lens file of any format", positional=True, metavar="FILE")
+    file: Path = cli.lens(positional=True, metavar="FILE")
     out: Path = cli.output_path("OUT.toml", "lens file to write")
     force: bool = setting(False, "replace an existing file", common=True)
     focal_length_mm: float | None = setting_of(Shot, "focal_length_mm")
