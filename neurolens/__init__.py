@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     def _run(*given: Any, **named: Any) -> Answer: ...
 
     lens, camera = Lens.make, Camera.make
-    analyse = bokeh = convert = copies = defocus = export = find = flare = handover = plan = projection = psf = _run
-    render = stmap = train = verify = _run
+    analyse = bokeh = convert = copies = defocus = export = find = flare = handover = plan = \
+        projection = psf = render = stmap = train = verify = _run  # fmt: skip
 
 __version__ = "0.1.0"
 # What pip calls this project. `neurolens` on PyPI is another one, with the same folder and command.
