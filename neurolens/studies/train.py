@@ -233,8 +233,7 @@ def _draw(
         illumination_plot(light, folder / "illumination.png", title=f"{lens.name}: relative illumination")
         figures.append(("illumination", "Relative illumination", "Of a uniform scene, full aperture, far focus."))
     return [
-        {"file": f"{folder.name}/{stem}.png", "title": title, "caption": caption, "wide": stem == "trade"}
-        for stem, title, caption in figures
+        {"file": f"{folder.name}/{stem}.png", "title": title, "caption": caption} for stem, title, caption in figures
     ]
 
 
