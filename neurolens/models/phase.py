@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.models.cores import Array, Network, Phased, angle_vector
 from neurolens.models.fitted import FilmRays
@@ -48,7 +49,7 @@ from neurolens.models.terms import (
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays, on_plane
-from neurolens.optics.trace.rays import optical_path, passing, trace
+from neurolens.optics.trace.rays import optical_path, trace
 from neurolens.optics.trace.surfaces import Rays
 
 TERMS, FINE_WAVES = 120, 0.0015  # at most, and the RMS at which no term is added
@@ -133,8 +134,9 @@ def _towards_axis(model: LensModel, rays: FilmRays) -> FilmRays:
     film[::2] = pupil[::2] = 1.0
     shares = (film**2, film**2, 1.0, pupil, pupil, 1.0)
     moved = FilmRays(*(c * torch.as_tensor(share) for c, share in zip(rays.columns(), shares, strict=True)))
-    toward = camera_rays(*moved.columns()[:5], model.domain.pupil_z_mm)
-    return moved.select(passing(model.lens, toward, moved.wavelength_nm))
+    points = moved.film_x, moved.film_y, moved.film_z, moved.pupil_x, moved.pupil_y
+    toward = camera_rays(*points, model.domain.pupil_z_mm)
+    return moved.select(trace(model.lens, toward, moved.wavelength_nm).status == st.PASSED)
 
 
 def _polynomial(model: LensModel, fit: tuple[Tensor, Tensor, Tensor], terms: int) -> tuple[Exponents, Array, Tensor]:

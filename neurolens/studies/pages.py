@@ -158,7 +158,7 @@ def _why_model(model: Mapping[str, Any], exact: Mapping[str, Any] | None, within
 
 def ns_text(timing: Mapping[str, Any]) -> str:
     """Return a time in words, with "~" before a noisy one."""
-    return f"{'~' * noisy(timing)}{timing['min']:.3g} ns" if timing else "-"
+    return f"{'~' * noisy(timing)}{show(timing['min'], 3, ',')} ns" if timing else "-"
 
 
 Record = Mapping[str, Any]
