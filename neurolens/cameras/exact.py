@@ -32,7 +32,7 @@ from neurolens.optics.lens.glass import LINE_D_NM, check_light, index_of
 from neurolens.optics.lens.paraxial import PupilBounds, chief_reach_mm, first_order
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.lens.shot import BY_LENSES, Shot
-from neurolens.optics.setting.focusing import at_infinity
+from neurolens.optics.setting.focusing import at_infinity, require_film
 from neurolens.optics.setting.pupils import passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
 from neurolens.optics.trace.surfaces import Rays, media
@@ -106,7 +106,7 @@ class ExactCamera(LensCamera):
         self._light_nm = used = shot.wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         for nm in used:
             check_light(lens, nm)
-        self.lens = set_lens(lens, replace(shot, focus_m=given.focus_m))
+        self.lens = require_film(set_lens(lens, replace(shot, focus_m=given.focus_m)))
         shot = replace(shot, focus_m=focus_of(self.lens, given), focus_mode=focus_mode_of(self.lens, given))
         warn_beyond(self.path, self.lens, FilmPose.of(shot))
         film_z, tabled, stop_mm = self.lens.film_z_mm, at_infinity(self.lens), float(self.lens.stop_radius_mm)

@@ -33,6 +33,7 @@ from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import BY_LENSES, POSES
 from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.focusing import require_film
 from neurolens.optics.setting.states import set_lens
 from neurolens.pictures.flare.canvas import Raster
 from neurolens.pictures.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
@@ -330,7 +331,7 @@ class Shots:
     def at(self, args: Flare) -> Shot:
         """The flare of the frame with these arguments."""
         if self._last is None or self._last[0] is not args:
-            lens = self._lens(args.state)
+            lens = require_film(self._lens(args.state))
             pose = FilmPose.of(args.state.shot(args.film).whole())
             warn_beyond(args.file, lens, pose)
             lights, tracer = self._lights(args, lens), GhostTracer(lens, pose=pose)

@@ -33,6 +33,7 @@ from neurolens.base.records import plain
 from neurolens.base.tasks import Failed, run_each
 from neurolens.models.model import LensModel
 from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.setting.focusing import require_film
 from neurolens.pictures.defocus.diffraction import Channels, spreads
 from neurolens.pictures.render.film import digest
 
@@ -62,7 +63,7 @@ class PsfTask:
     model: LensModel | None = None
 
     def __post_init__(self) -> None:
-        lens, front_m = self.lens, float(self.lens.film_z_mm or 0) / 1000
+        lens, front_m = require_film(self.lens), float(self.lens.film_z_mm or 0) / 1000
         if self.model is not None:
             from neurolens.models.wavefront import checked_path
 

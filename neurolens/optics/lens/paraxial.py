@@ -150,7 +150,8 @@ def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridi
     y, u = ahead.y[-1], ahead.after[-1]
     if u == 0:
         if not is_pinhole(lens):
-            raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
+            plane = f" in the {meridian}-z plane" * lens.anamorphic
+            raise InputError(lens.path, "surfaces", f"(an afocal system{plane})", "a lens with a finite focal length")
         return _pinhole(lens, system)
     back = turned.march(1.0, 0.0)
     efl, back_focus = -1.0 / u, -y / u

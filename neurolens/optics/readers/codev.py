@@ -422,8 +422,7 @@ def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
         across, up = file.fields.get(x, []), file.fields.get(y, [])
         longest = max(len(across), len(up))
         across, up = across + [0.0] * (longest - len(across)), up + [0.0] * (longest - len(up))
-        distance = from_axis_deg if y == "YAN" else math.hypot
-        far = max([far, *map(distance, across, up)])
+        far = max([far, *map(from_axis_deg if y == "YAN" else math.hypot, across, up)])
     return far or None
 
 

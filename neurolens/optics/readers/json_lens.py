@@ -138,7 +138,7 @@ def _load(path: str | Path) -> dict[str, Any]:
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
-        raise InputError(path, "file", f"({error})", "valid JSON") from None
+        raise InputError(path, "file", f"({error})", "valid JSON, none of ray-optics or Optiland") from None
     if not isinstance(data, dict):
         raise InputError(path, "file", f"(a {type(data).__name__})", "a JSON object with the key surfaces")
     if "surfaces" not in data:

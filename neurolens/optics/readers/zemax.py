@@ -415,8 +415,8 @@ def _solved(blocks: Sequence[Block], gaps: list[float]) -> bool:
 def _set_field(file: File) -> None:
     """Set half field or image radius by the farthest field point. FTYP 0 is an angle, 2 and 3 are image heights."""
     points = [(x, y) for x, y in zip(*(file.heights.get(k, [0.0] * 100) for k in ("XFLN", "YFLN")), strict=False)]
-    distance = math.hypot if file.field_type else from_axis_deg
-    edge = max((distance(x, y) for x, y in points[: file.fields or None]), default=0.0)
+    away = (from_axis_deg(*p) if file.field_type == 0 else math.hypot(*p) for p in points[: file.fields or None])
+    edge = max(away, default=0.0)
     if edge > 0 and file.field_type == 0:
         file.half_field_deg = edge
     elif edge > 0 and file.field_type in (2, 3):

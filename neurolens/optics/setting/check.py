@@ -35,7 +35,6 @@ BLUR_LIMIT = 0.003  # RMS radius over focal length; a good lens has 0.0001 to 0.
 SIMPLE = 2  # with at most so many refractions, blur is no sign of a mistake
 DARK = 0.02  # illumination of the corner relative to the axis, below which the corner counts as dark
 _TINY_MM = 1e-3
-_BACK_FOCUS = "back focus, mm"
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,7 @@ def check_lens(lens: Lens) -> list[Check]:
     data = first_order(lens)
     # Of an object near the lens, whose film and blur are not those at infinity; its state is checked below.
     near = any(c.object_distance_mm is not None and not c.thickness_mm for c in lens.configurations)
-    table = [check for check in _first_order(lens, data) if not (near and check.quantity == _BACK_FOCUS)]
-    found = [*table, _beam(lens, data), _edges(lens), *_field(lens)]
+    found = [*_first_order(lens, data, near=near), _beam(lens, data), _edges(lens), *_field(lens)]
     if data.efl_mm > 0:
         found += [] if near else [_blur(lens, data)]
         found += _corner(lens)
@@ -98,11 +96,11 @@ def verdict(checks: list[Check]) -> str:
     return "doubtful" if any(c.doubt for c in checks) else "ok"
 
 
-def _first_order(lens: Lens, data: FirstOrder) -> Iterator[Check]:
+def _first_order(lens: Lens, data: FirstOrder, *, near: bool = False) -> Iterator[Check]:
     yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
     if lens.anamorphic:
         yield _focal_length(lens, first_order(lens, meridian="x").efl_mm, lens.stated_efl_x_mm, " (x-z plane)")
-    yield _back_focus(lens, data.back_focus_mm, data.efl_mm)
+    yield _back_focus(lens, data.back_focus_mm, data.efl_mm, near=near)
     n, stated = data.f_number, lens.f_number
     off = math.isfinite(stated) and abs(n / stated - 1) > F_NUMBER_TOLERANCE
     doubt = f"the stop gives f/{n:.3g}, the source says f/{stated:.3g}" if off else ""
@@ -118,11 +116,13 @@ def _focal_length(lens: Lens, efl: float, stated: float | None, plane: str = "")
     return Check(f"focal length{plane}, mm", efl, stated, doubt)
 
 
-def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
+def _back_focus(lens: Lens, computed: float, efl: float, *, near: bool = False) -> Check:
     tabled, last = float(lens.surfaces[-1].thickness_mm), float(lens.vertices_mm[-2])
     film = f"the table's last thickness puts the film at z = {last + tabled:.2f} mm"
-    wrong = efl > 0 and abs(computed - tabled) > FOCUS_TOLERANCE * efl
-    return Check(_BACK_FOCUS, computed, tabled, f"{film}, its focus is at {last + computed:.2f} mm" * wrong)
+    inside = f"the image lies {-computed:.4g} mm in front of the last surface, where no film can be"
+    wrong = not near and abs(computed - tabled) > FOCUS_TOLERANCE * efl  # the film of a near table is its own
+    doubt = inside if computed < 0 else f"{film}, its focus is at {last + computed:.2f} mm" * wrong
+    return Check("back focus, mm", computed, tabled, doubt * (efl > 0))
 
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:

@@ -41,6 +41,16 @@ def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) 
     return PchipInterpolator(known, values)(place).tolist()
 
 
+def require_film(lens: Lens) -> Lens:
+    """Return a lens that is set; InputError if its film would not lie behind its last surface."""
+    behind = float((lens.film_z_mm or 0.0) - lens.vertices_mm[len(lens.surfaces) - 1])
+    if behind < 0:
+        raise InputError(
+            lens.path, "film", f"({-behind:.4g} mm in front of the last surface)", "an image behind the lens"
+        )
+    return lens
+
+
 SAME_MM = 0.005  # gaps of two states that differ by less count as the same: sources give two decimals
 
 

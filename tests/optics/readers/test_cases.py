@@ -4,6 +4,7 @@ Focal lengths are those of ray-optics 0.9.8 and of the files' own heads, unless 
 """
 
 import json
+import math
 import warnings
 from pathlib import Path
 
@@ -12,13 +13,17 @@ from test_tables_oslo import OSLO
 from test_zemax import BODY, DUMMY, HEAD, TAIL, read, swapped
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.build import make_camera
 from neurolens.cli import main
 from neurolens.optics.lens import glass as catalogue
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.readers.source import ReadOptions
 from neurolens.optics.setting.check import check_lens, doubts
+from neurolens.optics.setting.states import set_lens
+from neurolens.programs.psf import PsfTask
 
 OTHERS = Path(__file__).parents[4] / "shared" / "data" / "cases" / "2026-11-28"
 CASES = Path(__file__).parents[4] / "shared" / "data" / "cases"
@@ -283,6 +288,33 @@ def test_the_film_of_a_near_object_is_judged_by_its_image(tmp_path: Path) -> Non
         lens, _ = heard_text(swapped("DISZ INFINITY", "DISZ 120", text), tmp_path)
         told = "\n".join(doubts(check_lens(lens)))
         assert told.startswith(said) and bool(told) == bool(said)
+
+
+def test_a_film_in_front_of_the_last_surface_makes_no_picture(tmp_path: Path) -> None:
+    """A rod of glass whose front focuses inside it: its image is as far in front of its end as the back focus says."""
+    text = HEAD + BODY + TAIL
+    for old, new in (("CURV 2.0E-2", "CURV 5.0E-2"), ("CURV -2.0E-2", "CURV -5.0E-2"), ("DISZ 5.0", "DISZ 100")):
+        text = swapped(old, new, text)
+    lens, _ = heard_text(text, tmp_path)
+    curvature, n = 0.05, lens.surfaces[0].n_d
+    power, left = (n - 1) * curvature, 1 - (n - 1) * curvature * 100 / n  # of an end; height at the second end
+    behind = left / (power * (1 + left))
+    assert behind < 0 < first_order(lens).efl_mm
+    assert f"the image lies {-behind:.4g} mm in front of the last surface" in "\n".join(doubts(check_lens(lens)))
+    with pytest.raises(
+        InputError, match=r"film: got \(.* in front of the last surface\), expected an image behind the lens"
+    ):
+        make_camera(tmp_path / "lens.zmx", Shot((24.0, 16.0)))
+    with pytest.raises(InputError, match=r"film: got \(.* in front of the last surface"):
+        PsfTask(set_lens(lens), math.inf, ((0.0, 0.0),), ((550.0,),), 0.006, None)
+
+
+def test_a_cylinder_is_afocal_in_one_plane(tmp_path: Path) -> None:
+    text = swapped("TYPE STANDARD\n  CURV 2.0E-2", "TYPE TOROIDAL\n  CURV 2.0E-2", HEAD + BODY + TAIL)
+    lens, _ = heard_text(swapped("CURV -2.0E-2", "CURV 0", text), tmp_path)
+    assert first_order(lens).efl_mm == pytest.approx(50 / (lens.surfaces[0].n_d - 1))
+    with pytest.raises(InputError, match=r"\(an afocal system in the x-z plane\)"):
+        first_order(lens, meridian="x")
 
 
 def heard_text(text: str, tmp_path: Path) -> tuple[Lens, str]:

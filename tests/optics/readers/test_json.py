@@ -158,7 +158,7 @@ def test_refusals(change: dict[str, Any], message: str, tmp_path: Path) -> None:
         ('{"name": -Infinity}', r"-Infinity is no finite number"),
         ('{"name": "a"}', r"format: got \(not known: JSON without the key surfaces\)"),
         ('{"name": "a"', r"file: got \(Expecting"),
-        ("[" * 100_000, r"expected valid JSON"),
+        ("[" * 100_000, r"expected valid JSON, none of ray-optics or Optiland"),
         ('{"f_number": 1' + "0" * 5000 + "}", r"f_number|expected valid JSON"),
     ],
 )
