@@ -106,9 +106,19 @@ def check_tree(data: Any, file: str | Path) -> None:
         raise InputError(file, level[0][0].partition(".")[0], "(nested too deep)", f"at most {_DEEPEST} tables")
 
 
+_ELSEWHERE = {  # what other programs call a setting
+    **dict.fromkeys(("fstop", "f_stop", "aperture", "t_stop", "iris"), "f_number"),
+    **dict.fromkeys(("resolution", "res", "size", "resolution_x"), "width"),
+    **dict.fromkeys(("focus_distance", "focal_distance", "distance"), "focus"), "spp": "samples",
+    **dict.fromkeys(("sensor", "sensor_size", "sensor_width", "filmback"), "film"),
+}  # fmt: skip
+
+
 def suggestion(word: str, known: Sequence[str]) -> str:
     """Return "; did you mean ...?" with the nearest known key, or nothing; a key that only lacks its unit is near."""
-    near = [key for key in known if key.startswith(word + "_")] or get_close_matches(word, known, n=1)
+    meant = _ELSEWHERE.get(word.replace("-", "_"), word) + "_"
+    near = [key for key in known if f"{key}_".replace("-", "_").startswith(meant)]
+    near = near or get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 

@@ -133,7 +133,7 @@ class Packed(Report):
     def text(self) -> str:
         """Return the file and how much is in it."""
         count, shaders = len(self.lenses), sum(map(len, self.lenses.values()))
-        return f"{self.file}: {count} lens{'es' * (count > 1)}, {shaders} shaders"
+        return f"{self.file}: {count} lens{'es' * (count > 1)}, {shaders} shader{'s' * (shaders > 1)}"
 
 
 @dataclass(frozen=True, kw_only=True)
