@@ -55,9 +55,9 @@ from neurolens.optics.trace.surfaces import Rays
 TERMS, FINE_WAVES = 120, 0.0015  # at most, and the RMS at which no term is added
 # Where all terms leave more than the first RMS, and less than the second, a network of two layers stands beside them.
 # It is fitted to what this share of the terms leaves, which is smoother than what all leave: of that it learns half or
-# nothing. It trains for a minute on one core: a few starts on each fourth ray, then the best on each second.
+# nothing. It trains for a minute on one core, and is kept where it helps the rays that it has not seen.
 ENOUGH_WAVES, _MOST_WAVES = 0.01, 1.0
-_UNITS, _STARTS, _STEPS, _SMOOTH = 24, 2, 240, 5 / 12
+_UNITS, _STEPS, _SMOOTH, _SEEN = 24, 160, 5 / 12, (7, 8)
 # Where they leave more, rays count by their blur on the film, half at this: where there is no image, a small share of
 # a large error is as large as all of it in the image.
 _SHARP_UM = 100.0
@@ -104,9 +104,12 @@ def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
         if off >= _MOST_WAVES:
             exponents, path, _ = _polynomial(model, _known(model, core, _towards_axis(model, rays), _SHARP_UM), TERMS)
         elif off > ENOUGH_WAVES:
-            _, _, left = _polynomial(model, fit, int(_SMOOTH * TERMS))
-            rest, taken = _network(variables, left, weights, unit)
-            exponents, path, _ = _polynomial(model, (variables, wanted - taken, weights), TERMS)
+            _, _, smooth = _polynomial(model, fit, int(_SMOOTH * TERMS))
+            seen = len(rays) * _SEEN[0] // _SEEN[1]
+            network, taken = _network(variables, smooth, weights, unit, seen)
+            *beside, still = _polynomial(model, (variables, wanted - taken, weights), TERMS)
+            if float((still * weights)[:, seen:].norm()) < float((left * weights)[:, seen:].norm()):
+                (exponents, path), rest = beside, network
     return replace(model, core=replace(core, exponents=exponents, path=path, rest=rest))
 
 
@@ -237,15 +240,16 @@ def _chosen(
     return candidates[sorted(sweep.chosen)]
 
 
-def _network(variables: Tensor, left: Tensor, weights: Tensor, unit: float) -> tuple[Network, Tensor]:
-    """Fit a network to what a polynomial leaves [1, N], in units of `unit`; and return what it takes of that."""
+def _network(variables: Tensor, left: Tensor, weights: Tensor, unit: float, seen: int) -> tuple[Network, Tensor]:
+    """Fit a network to what a polynomial leaves of the first rays [1, N], and return what it takes of that of all.
+
+    `unit`: of its output, in um. `seen`: how many rays it is fitted to.
+    """
     inputs, shift, scale = scaled(variables)
-    vectors = left.new_zeros((1, 2, left.shape[1]))
-    problem = Problem(inputs, vectors, vectors, vectors[:0], vectors[:0, 0], left / unit, weights[None])
-    layers = [random_layers(inputs, _UNITS, 2, seed) for seed in range(_STARTS)]
-    tried = [minimise(problem.every(4), OptimiserState(some), _STEPS // 6)[0] for some in layers]
-    start = OptimiserState(min(tried, key=lambda found: found.loss).hidden)
-    best, _ = minimise(problem.every(2), start, _STEPS)
+    vectors = left.new_zeros((1, 2, seen))
+    given = left[:, :seen] / unit, weights[None, :seen]
+    problem = Problem(inputs[:seen], vectors, vectors, vectors[:0], vectors[:0, 0], *given)
+    best, _ = minimise(problem, OptimiserState(random_layers(inputs, _UNITS, 2, 0)), _STEPS)
     *hidden, (weight, bias) = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
     found = Network(tuple(hidden), (unit * weight, unit * bias), shift.numpy(), scale.numpy())
     return found, unit * best.output @ activations(best.hidden, inputs)[-1].T

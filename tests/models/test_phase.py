@@ -167,7 +167,7 @@ def test_a_network_takes_what_few_terms_leave(
     rays = passing_rays(plain.lens, plain.domain, 4000, seed=5, batch=8192).inputs
     monkeypatch.setattr(phase, "TERMS", 12)
     monkeypatch.setattr(phase, "_UNITS", 8)
-    monkeypatch.setattr(phase, "_STEPS", 80)
+    monkeypatch.setattr(phase, "_STEPS", 40)
     monkeypatch.setattr(phase, "_MOST_WAVES", math.inf)
     errors, models = [], list[LensModel]()
     for enough in (math.inf, phase.ENOUGH_WAVES):
