@@ -36,7 +36,7 @@ from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays
 
-_RAYS = 28  # along a side of the box about what passes
+_RAYS = 24  # along a side of the box about what passes
 # Pupils fill ellipses in their boxes, in which rays are taken: in two spirals of half the golden angle, as many in each
 # part. Ellipses lean by the correlation of x and y, of which few steps are told apart, so that fits are kept.
 _ELLIPSE, _LEANS, _FEW, _MANY = 0.96, 32, 256, 800

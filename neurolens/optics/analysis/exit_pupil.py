@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,7 +71,7 @@ class ExitPupil:
     hits_mm: Array
     box: Array
 
-    @property
+    @cached_property
     def blur_mm(self) -> float:
         """Return the greatest distance of a ray from the centre on the film."""
         return float(np.hypot(*self.hits_mm).max())
@@ -142,8 +142,9 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     count = count[:, :, :-1] + count[:, :, 1:]
     w, i, j = edge = np.nonzero(count & 3)  # some of the four corners are lit, not all
     corner = (w * (cells + 1) + i) * (cells + 1) + j
-    ends = at.reshape(*at.shape[:2], -1)[..., corner[:, None] + [0, cells + 1, 1, cells + 2]]
-    inside = _lets(aperture, limits[:, w], ends @ _WAYS).astype(np.float32)
+    ends = at.reshape(*at.shape[:2], -1).take(np.add.outer(corner, [0, cells + 1, 1, cells + 2]), 2)
+    cuts = ((ends * ends).sum(1).max((1, 2)) > (limits * limits).min(1)) | (np.arange(len(limits)) == 0)
+    inside = _lets(aperture, limits[cuts][:, w], ends[cuts] @ _WAYS).astype(np.float32)
     whole = (count == 4).astype(np.float32)
     shape, aside = (len(pupils), cells + 2, cells + 2), np.outer(np.arange(3) * (cells + 2), [1, 1, 1]) + np.arange(3)
     place = np.ravel_multi_index(edge, shape)[:, None] + aside.reshape(-1)
