@@ -220,6 +220,11 @@ def test_messages_are_one_line_whatever_the_value() -> None:
         ),
         (RecursionError("deep"), "a fault of neurolens: RecursionError; please report"),
         (MemoryError("Unable to allocate 1 TiB"), "not enough memory (Unable to allocate 1 TiB)"),
+        (
+            ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+            "not enough memory (libtorch_cpu.so",
+        ),
+        (ImportError("a.so: failed to map segment: Operation not permitted"), "a fault of neurolens: ImportError"),
         (ModuleNotFoundError("No module named 'numpy'", name="numpy"), "a fault of neurolens: ModuleNotFoundError"),
     ],
 )

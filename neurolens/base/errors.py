@@ -130,6 +130,13 @@ def missing(error: BaseException) -> str:
     return f"this needs {package}, which is not installed: {pip_install(EXTRAS[package])}"
 
 
+def out_of_memory(error: BaseException) -> bool:
+    """Test whether memory ran out: for values, or for the code of a library, whose loader then fails."""
+    unmapped = isinstance(error, ImportError) and "failed to map segment" in str(error)
+    # In a folder from which nothing may be run the loader says the same, and why.
+    return isinstance(error, MemoryError) or (unmapped and "not permitted" not in str(error))
+
+
 @contextmanager
 def installed() -> Iterator[None]:
     """In the block, an import that does not find a package is a NeurolensError that says what brings it."""

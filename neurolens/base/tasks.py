@@ -33,7 +33,7 @@ from multiprocessing.connection import wait
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from neurolens.base.errors import NeurolensError, missing, one_line, reason
+from neurolens.base.errors import NeurolensError, missing, one_line, out_of_memory, reason
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -255,7 +255,7 @@ def failure(error: Exception) -> Failed:
     """Return the reason that an error gives, in one line: errors travel between processes as text."""
     if isinstance(error, NeurolensError) or missing(error):
         return Failed(one_line(reason(error), _LONGEST))
-    if isinstance(error, MemoryError):
+    if out_of_memory(error):
         return Failed(one_line(f"a worker ran out of memory ({error or 'no more is known'})", _LONGEST))
     frame = traceback.extract_tb(error.__traceback__)[-1]
     said = one_line(f"a fault of neurolens: {type(error).__name__}: {error}", _LONGEST)

@@ -23,6 +23,7 @@ from neurolens.base.errors import (
     Note,
     missing,
     one_line,
+    out_of_memory,
     printable,
     reason,
 )
@@ -207,7 +208,7 @@ def _fault(error: Exception) -> int:
         import traceback
 
         traceback.print_exception(error)
-    if isinstance(error, MemoryError):
+    if out_of_memory(error):
         return _fail(f"not enough memory ({error})", _FAULT)
     found = f"{type(error).__name__}: {error}" if not isinstance(error, RecursionError) else "RecursionError"
     asked = f"please report this line, the command and its files, with {_TRACEBACK}=1 for details"

@@ -192,6 +192,7 @@ class Spread(Report):
         how = f"{self.by_rays} of them by rays, " if self.by_rays else ""
         how += f"{cli.number(self.cpu_s_a_psf, 2)} CPU s each" if self.cpu_s_a_psf else "made on a cluster"
         return (
-            f"{self.file}: {self.psfs} point spreads of {', '.join(self.channels)}, {self.side_px} pixels a side, "
+            f"{self.file}: {self.psfs} point spread{'s' * (self.psfs > 1)} of {', '.join(self.channels)}, "
+            f"{self.side_px} pixels a side, "
             f"{how}; at least {self.least_inside:.1%} of the light inside"
         )
