@@ -142,8 +142,9 @@ def page(rows: Sequence[Row]) -> str:
     refused = [f"- {r['lens']}: {r['refused']}" for r in rows if "refused" in r]
     return lab.page(
         f"# The optical path of models\n\n`python -m experiments phase`\n\nUp to {TERMS} terms beside the rays, and a "
-        f"network where they leave more than {ENOUGH_WAVES} waves and less than one. Waves are of 546 nm; path and "
-        "rays: the median distance on the film between where each says that light goes.",
+        f"network where they leave more than {ENOUGH_WAVES} waves and less than one. Where that is more, rays count by "
+        "their blur, so that the path is known where there is an image. Waves are of 546 nm; path and rays: the median "
+        "distance on the film between where each says that light goes.",
         lab.goal_table("goal", goals), lab.table(columns, done, "-"),
         *(["No path:", "\n".join(refused)] if refused else []),
     )  # fmt: skip

@@ -107,9 +107,9 @@ def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
             _, _, smooth = _polynomial(model, fit, int(_SMOOTH * TERMS))
             seen = len(rays) * _SEEN[0] // _SEEN[1]
             network, taken = _network(variables, smooth, weights, unit, seen)
-            *beside, still = _polynomial(model, (variables, wanted - taken, weights), TERMS)
-            if float((still * weights)[:, seen:].norm()) < float((left * weights)[:, seen:].norm()):
-                (exponents, path), rest = beside, network
+            beside = _polynomial(model, (variables, wanted - taken, weights), TERMS)
+            if float((beside[2] * weights)[:, seen:].norm()) < float((left * weights)[:, seen:].norm()):
+                (exponents, path, _), rest = beside, network
     return replace(model, core=replace(core, exponents=exponents, path=path, rest=rest))
 
 
