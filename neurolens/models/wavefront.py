@@ -19,6 +19,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
@@ -187,7 +188,7 @@ class _Known:
         passed = self._passes(out, np.tile(led + slope * back, waves), _BEYOND * wide, _BEYOND**2 - 1)
         near = self._passes(first, point + slope * back, _NEAR * wide, _NEAR**2 - 1)
         near &= (passed & np.isfinite(wave[0])).reshape(waves, -1).all(0)
-        crossed, energy = self._across(foot, np.tile(axis, waves), None if source is None else np.tile(source, waves))
+        crossed, energy = self._across(foot, seen[3:], source)
         gates = np.stack([g := out.get("gates", np.zeros((0, foot.shape[1]))) + _RIM, 0 * g], 1)
         # The ellipse is a rim, too: beyond it polynomials may come back into the stop.
         rows = np.concatenate(
@@ -273,27 +274,28 @@ class _Known:
 
     def _point_of(self, direction: Array) -> Array:
         """Return the points P [2, N] of the focal plane whose directions s(P) are these [3, N]."""
-        sine = np.hypot(*direction[:2])
-        angle, rise = np.arctan2(sine, -direction[2]), np.polynomial.Polynomial(self.core.direction)
-        steep = rise.deriv()
-        radius = angle / self.core.direction[0]
+        sine, slopes = np.hypot(*direction[:2]), np.array(self.core.direction)
+        angle, steep = np.arctan2(sine, -direction[2]), slopes * np.arange(1, 2 * len(slopes), 2)
+        radius = angle / slopes[0]
         for _ in range(_NEWTON):
             square = radius * radius
-            risen = rise(square)
-            radius -= (radius * risen - angle) / (risen + 2 * square * steep(square))
+            radius -= (radius * polyval(square, slopes) - angle) / polyval(square, steep)
         return direction[:2] * (radius / np.where(sine > 0, sine, 1.0))
 
-    def _across(self, foot: Array, axis: Array, source: Array | None) -> tuple[Array, Array | float]:
+    def _across(self, foot: Array, axis: Array, source: Array | None) -> tuple[Array, Array]:
         """Return places [2, N] on the planes across chief rays, and the energy per area of them, as `bundles.Aim`.
 
-        `foot` and `source` [3, N] are counted from the front focal point; `axis` [3, N] are the chief rays.
+        `foot` [3, N], by wavelength, place and ray, and `source` [3, N / W] are counted from the front focal point;
+        `axis` [3, P] are the chief rays.
         """
         beside = np.where(np.abs(axis[1]) < 0.9, np.array([[0.0], [1.0], [0.0]]), np.array([[1.0], [0.0], [0.0]]))
         first = np.cross(axis, beside, axis=0)
         across = np.stack([first, np.cross(axis, first, axis=0)]) / np.linalg.norm(first, axis=0)
-        if source is None:
-            return (across * foot).sum(1), 1.0
-        way = source - foot
-        met = foot - way * ((axis * foot).sum(0) / (axis * way).sum(0))
-        away = source - met
-        return (across * met).sum(1), (axis * away).sum(0) / np.linalg.norm(away, axis=0) ** 3
+        foot, energy = foot.reshape(3, len(self.waves), len(axis[0]), -1), np.array(1.0)
+        if source is not None:
+            source, axis = source.reshape(3, 1, len(axis[0]), -1), axis[:, None, :, None]
+            way = source - foot
+            foot = foot - way * ((axis * foot).sum(0) / (axis * way).sum(0))
+            away = source - foot
+            energy = ((axis * away).sum(0) / np.linalg.norm(away, axis=0) ** 3).reshape(-1)
+        return np.einsum("cip,iwpn->cwpn", across, foot).reshape(2, -1), energy

@@ -140,18 +140,19 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     count = _lets(aperture, limits, at).view(np.int8)
     count = count[:, :-1] + count[:, 1:]
     count = count[:, :, :-1] + count[:, :, 1:]
-    w, i, j = edge = np.nonzero(count & 3)  # some of the four corners are lit, not all
+    edge = np.flatnonzero((count & 3) != 0)  # some of the four corners are lit, not all
+    w, i, j = np.unravel_index(edge, count.shape)
     corner = (w * (cells + 1) + i) * (cells + 1) + j
     ends = at.reshape(*at.shape[:2], -1).take(np.add.outer(corner, [0, cells + 1, 1, cells + 2]), 2)
     cuts = ((ends * ends).sum(1).max((1, 2)) > (limits * limits).min(1)) | (np.arange(len(limits)) == 0)
     inside = _lets(aperture, limits[cuts][:, w], ends[cuts] @ _WAYS).astype(np.float32)
     whole = (count == 4).astype(np.float32)
     shape, aside = (len(pupils), cells + 2, cells + 2), np.outer(np.arange(3) * (cells + 2), [1, 1, 1]) + np.arange(3)
-    place = np.ravel_multi_index(edge, shape)[:, None] + aside.reshape(-1)
+    place = np.ravel_multi_index((w, i, j), shape)[:, None] + aside.reshape(-1)
     given = np.bincount(place.reshape(-1), (inside @ _MOMENTS).reshape(-1), math.prod(shape)).reshape(shape)
     smooth = sum(np.eye(cells, k=k, dtype=np.float32) * m for k, m in zip((-1, 0, 1), _NEAR.mean(1), strict=True))
     weight = smooth @ whole @ smooth + given[:, 1:-1, 1:-1]
-    whole[edge] = inside.mean(-1)
+    whole.reshape(-1)[edge] = inside @ np.full(_PARTS**2, 1 / _PARTS**2, np.float32)
     return whole, np.asarray(weight, np.float32)
 
 
@@ -277,13 +278,13 @@ def fitted_waves(
         inside = np.where(left.any(1, keepdims=True), left, inside)
     figures = _fitted(design, half, rows)
     every = -(design.slopes @ figures[:, _I, _J, 0].T / half[:, None, None]).transpose(2, 0, 1)
-    found = list[ExitPupil | None]()
-    for nm, hits, own, through in zip(wavelengths_nm, every, figures, inside, strict=True):
-        hits = hits[:, through]
-        centre = hits.mean(1)
-        own[[1, 0], [0, 1], 0] += half * centre
-        at, limits, hits = place + centre, tuple(limits_mm[cut]), hits - centre[:, None]
-        found.append(ExitPupil(nm, at, middle, half, own, limits, aperture, hits, np.zeros((2, 2))))
+    centres = (every * inside[:, None]).sum(2) / inside.sum(1)[:, None]
+    figures[:, [1, 0], [0, 1], 0] += half * centres
+    every, limits, nowhere = every - centres[..., None], tuple(limits_mm[cut]), np.zeros((2, 2))
+    found: list[ExitPupil | None] = [
+        ExitPupil(nm, place + centre, middle, half, own, limits, aperture, hits[:, through], nowhere)
+        for nm, centre, own, hits, through in zip(wavelengths_nm, centres, figures, every, inside, strict=True)
+    ]
     return found
 
 
