@@ -141,15 +141,16 @@ class _Known:
             _KNOWN[core] = graph, CompiledGraph.of(graph, {"film_z_mm": 0.0}) if has_compiler() else None
         self.graph, self.run = _KNOWN[core]
 
-    def rays(self, point: Array, cosines: Array, z_mm: float, nm: Array | float) -> dict[str, Array]:
-        """Return what the model says of rays through points [2, N] of a plane, by cosines [2, N] of light."""
-        pupil = point + cosines / _forwards(cosines) * (self.model.domain.pupil_z_mm - z_mm)
-        rows = np.concatenate([*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))])
+    def rays(self, point: Array, slope: Array, z_mm: float, nm: Array | float) -> dict[str, Array]:
+        """Return what the model says of rays through points [2, N] of a plane, which rise by slopes [2, N]."""
+        pupil = point + slope * (self.model.domain.pupil_z_mm - z_mm)
+        some = [*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))]
+        rows = np.concatenate(some, dtype=np.float64 if self.run is None else np.float32)
         if self.run is None:
             found = evaluate(self.graph, {"rays": rows, "film_z_mm": np.full((1, 1), z_mm)})
             return {name: np.broadcast_to(a, (len(a), pupil.shape[1])) for name, a in found.items()}
         self.run.numbers[:] = z_mm
-        return {name: a.astype(np.float64) for name, a in self.run({"rays": rows.astype(np.float32)}).items()}
+        return {name: a.astype(np.float64) for name, a in self.run({"rays": rows}).items()}
 
     def pupils(self, place: Array, count: int = _FEW) -> list[list[ExitPupil | None]]:
         """Return the pupils of film places [2, P], by place and wavelength, from so many rays; None without light."""
@@ -164,15 +165,15 @@ class _Known:
         source = self._source(each(seen))
         cosines = each(middle) + each(half) * np.concatenate(points, 1)
         light = np.concatenate([cosines, _forwards(cosines)[None]])
+        slope, back = light[:2] / light[2], self.model.domain.pupil_z_mm - focal_z
         point, axis = each(place + chief * (focal_z - film_z)), each(seen[3:])
-        first = self.rays(point, cosines, focal_z, self.waves[0])
+        first = self.rays(point, slope, focal_z, self.waves[0])
         foot, leaves, _ = foot_of(self.core, first["ray"])
         way = axis if source is None else (source - foot) / np.linalg.norm(source - foot, axis=0)
-        slope, back = light[:2] / light[2], self.model.domain.pupil_z_mm - focal_z
         # Rays of the source, by cosines: where those that leave so much aside come from. Then those with s(P) = d, or
         # between both, where they come from far: rays outside its pupil are none that the model knows.
         met, left = np.split(self._point_of(np.concatenate([way, leaves], 1)), 2, 1)
-        led, many = point + met - left, (np.tile(cosines, waves), focal_z, np.repeat(self.waves, places * count))
+        led, many = point + met - left, (np.tile(slope, waves), focal_z, np.repeat(self.waves, places * count))
         apart = (met - led) / self.model.domain.pupil_radius_mm
         even = led + (met - led) / np.maximum(1, np.hypot(*apart) / _ASTRAY)
         out, plane = self.rays(np.tile(led, waves), *many), self.rays(np.tile(even, waves), *many)
@@ -223,8 +224,8 @@ class _Known:
         for _ in range(_ROUNDS):
             tried = np.linspace(ends[0], ends[1], _SEARCH, axis=-1)
             slope = (tried - radius[:, None]) / back
-            cosines = ways * (slope / np.sqrt(1 + slope * slope)).reshape(-1)
-            out = self.rays(np.repeat(place, _SEARCH, 1), cosines, self.scene.film_z_mm, self.waves[0])
+            steep = ways * slope.reshape(-1)
+            out = self.rays(np.repeat(place, _SEARCH, 1), steep, self.scene.film_z_mm, self.waves[0])
             best = np.abs((ways * out["stop"]).sum(0)).reshape(slope.shape).argmin(1)
             ends = tried[every, np.clip(best + [[-1], [1]], 0, _SEARCH - 1)]
         return along * slope[every, best], out["ray"].reshape(6, *slope.shape)[:, every, best]
@@ -250,12 +251,12 @@ class _Known:
         for _ in range(2):
             pupil = low[..., None] + (high - low)[..., None] * share
             slope = (pupil - place[..., None]) / (domain.pupil_z_mm - film_z)
-            cosines = slope / np.sqrt(1 + (slope * slope).sum(0))
-            rays = (np.repeat(place, share.shape[2], 1), cosines.reshape(2, -1), film_z, self.waves[0])
+            rays = (np.repeat(place, share.shape[2], 1), slope.reshape(2, -1), film_z, self.waves[0])
             lit = self._passes(self.rays(*rays), pupil.reshape(2, -1), lens.stop_radius_mm).reshape(pupil.shape[1:])
             step, count = (high - low) / (_RAYS - 1), np.maximum(lit.sum(1), 1)
             ends = np.where(lit, pupil, np.inf).min(-1) - step, np.where(lit, pupil, -np.inf).max(-1) + step
             low, high = (np.where(lit.any(1), end, 0.0) for end in ends)
+        cosines = slope / np.sqrt(1 + (slope * slope).sum(0))
         middle = np.where(lit, cosines, 0.0).sum(-1) / count
         apart = np.where(lit, cosines - middle[..., None], 0.0)
         half = 2 * np.sqrt((apart * apart).sum(-1) / count).clip(1e-9)  # an ellipse has four times its variance

@@ -153,7 +153,7 @@ def reach_of(pupils: Sequence[ExitPupil | None]) -> float:
 
 
 def _centre(pupils: Sequence[ExitPupil]) -> Array:
-    return np.mean([p.centre_mm + p.hits_mm.mean(1) for p in pupils], 0) if pupils else np.zeros(2)
+    return np.mean([p.centre_mm for p in pupils], 0) if pupils else np.zeros(2)
 
 
 def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, side: int) -> Spread:

@@ -232,7 +232,11 @@ def fitted_pupil(
     middle, half = ((low + high) / 2, _ROOM * (high - low) / 2) if like is None else (like.middle, like.half)
     if not half.min() > _FLAT:
         return None
-    centre = rays.hits[:, inside].mean(1)
+    through = inside.copy()
+    if aperture is not None:
+        through &= aperture.inside(rays.at[rays.stop, 0], rays.at[rays.stop, 1], float(limits[rays.stop]))
+    through = through if through.any() else inside
+    centre = rays.hits[:, through].mean(1)
     every = range(len(limits))
     cut = [rays.stop, *(k for k in every if k != rays.stop and part[k, near].max() > 1)]
     design = _design(np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None]).tobytes())
@@ -241,13 +245,8 @@ def fitted_pupil(
     at, power = rays.at[cut][..., near].reshape(2 * len(cut), -1), (rays.power * energy)[near]
     figures = _fitted(design, half, np.array([0 * power, power, *places[:, near], *at])[:, None])[0]
     figures[_I, _J, 0] = [0, *wave]
-    through = inside.copy()
-    if aperture is not None:
-        through &= aperture.inside(rays.at[rays.stop, 0], rays.at[rays.stop, 1], float(limits[rays.stop]))
-    through = through if through.any() else inside
-    box = np.zeros((2, 2)) if box is None else box
-    found = ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), aperture, np.zeros((2, 0)), box)
-    return replace(found, hits_mm=(rays.hits - centre[:, None])[:, through])
+    hits, box = rays.hits[:, through] - centre[:, None], np.zeros((2, 2)) if box is None else box
+    return ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), aperture, hits, box)
 
 
 def fitted_waves(
