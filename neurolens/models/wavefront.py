@@ -162,13 +162,14 @@ class _Known:
         def each(values: Array) -> Array:
             return np.repeat(values, count, 1)  # of places, for their rays
 
-        source = self._source(each(seen))
+        source = self._source(seen)
         cosines = each(middle) + each(half) * np.concatenate(points, 1)
         light = np.concatenate([cosines, _forwards(cosines)[None]])
         slope, back = light[:2] / light[2], self.model.domain.pupil_z_mm - focal_z
         point, axis = each(place + chief * (focal_z - film_z)), each(seen[3:])
         first = self.rays(point, slope, focal_z, self.waves[0])
         foot, leaves, _ = foot_of(self.core, first["ray"])
+        source = None if source is None else each(source)
         way = axis if source is None else (source - foot) / np.linalg.norm(source - foot, axis=0)
         # Rays of the source, by cosines: where those that leave so much aside come from. Then those with s(P) = d, or
         # between both, where they come from far: rays outside its pupil are none that the model knows.

@@ -182,7 +182,7 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
         done += len(group)
         x, y = np.array([centre - p.centre_mm for p in group]).T[..., None] + line
         (share, weight), (cycles, light) = open_shares(group, cells), waves_of(group, cells)
-        area = np.array([np.prod(2 * p.half / cells) for p in group])
+        area = np.prod([2 * p.half / cells for p in group], 1)
         fold = max(k for k in (1, 2, 4) if k == 1 or cells // k >= max(rays, _FEWEST // 2))
         counted = spent = _by_rays(group, x, y, pixel_mm, light * share, fold) * area[:, None, None]
         if not by_rays:

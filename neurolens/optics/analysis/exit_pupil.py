@@ -130,13 +130,14 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     error four times as large on 160 cells across as these do on 80. Cells on an edge are divided; places at the rims
     are linear between their corners.
     """
-    aperture, rims = pupils[0].aperture, np.arange(max(len(p.limits_mm) for p in pupils))
+    aperture, rims = pupils[0].aperture, max(len(p.limits_mm) for p in pupils)
     # The stop, which comes first, stands again for rims that only other wavelengths have.
-    kept = [rims * (rims < len(p.limits_mm)) for p in pupils]
-    limits = np.array([np.array(p.limits_mm)[k] for p, k in zip(pupils, kept, strict=True)]).T
-    figures = [p.figures[..., 2 + 2 * k[:, None] + [0, 1]] for p, k in zip(pupils, kept, strict=True)]
-    series = np.array(figures, np.float32).transpose(3, 4, 0, 1, 2)
-    at = summed(series, (np.linspace(-1, 1, cells + 1),) * 2)
+    lack = [rims - len(p.limits_mm) for p in pupils]
+    limits = np.array([p.limits_mm + p.limits_mm[:1] * k for p, k in zip(pupils, lack, strict=True)]).T
+    kept = [[*range(2, 2 + 2 * (rims - k)), *[2, 3] * k] for k in lack]
+    series = np.array([p.figures.take(k, -1) for p, k in zip(pupils, kept, strict=True)], np.float32)
+    at = summed(series.transpose(3, 0, 1, 2), (np.linspace(-1, 1, cells + 1),) * 2)
+    at = at.reshape(rims, 2, *at.shape[1:])
     count = _lets(aperture, limits, at).view(np.int8)
     count = count[:, :-1] + count[:, 1:]
     count = count[:, :, :-1] + count[:, :, 1:]
@@ -150,10 +151,15 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     shape, aside = (len(pupils), cells + 2, cells + 2), np.outer(np.arange(3) * (cells + 2), [1, 1, 1]) + np.arange(3)
     place = np.ravel_multi_index((w, i, j), shape)[:, None] + aside.reshape(-1)
     given = np.bincount(place.reshape(-1), (inside @ _MOMENTS).reshape(-1), math.prod(shape)).reshape(shape)
-    smooth = sum(np.eye(cells, k=k, dtype=np.float32) * m for k, m in zip((-1, 0, 1), _NEAR.mean(1), strict=True))
-    weight = smooth @ whole @ smooth + given[:, 1:-1, 1:-1]
+    weight = _nearby(cells) @ whole @ _nearby(cells) + given[:, 1:-1, 1:-1].astype(np.float32)
     whole.reshape(-1)[edge] = inside @ np.full(_PARTS**2, 1 / _PARTS**2, np.float32)
-    return whole, np.asarray(weight, np.float32)
+    return whole, weight
+
+
+@lru_cache(maxsize=64)
+def _nearby(cells: int) -> Array:
+    """Return the matrix [cells, cells] that gives the middles on a line what whole cells weigh."""
+    return np.asarray(sum(np.eye(cells, k=k) * m for k, m in zip((-1, 0, 1), _NEAR.mean(1), strict=True)), np.float32)
 
 
 def _lets(aperture: Aperture | None, limits_mm: Array, at: Array) -> NDArray[np.bool_]:
@@ -267,10 +273,11 @@ def fitted_waves(
     if inside.sum(1).min() < 16 or near.sum() < _FEWEST:
         return None
     place, middle, half = box
-    cut = [k for k in range(len(limits_mm)) if k == 0 or part[k][:, near].max() > 1]
+    used = slice(None) if near.all() else near
+    cut = [k for k in range(len(limits_mm)) if k == 0 or part[k][:, used].max() > 1]
     kept = [*range(4), *(4 + 2 * k + way for k in cut for way in (0, 1))]
-    design = _common(points.tobytes()) if near.all() else _design(points[:, near].tobytes())
-    rows, inside = rows[kept][:, :, near], inside[:, near]
+    design = (_common if near.all() else _design)(points[:, used].tobytes())
+    rows, inside = rows[kept][:, :, used], inside[:, used]
     rows[0] -= rows[0, :, :1]  # paths are long
     if aperture is not None:
         left = inside & aperture.inside(rows[4], rows[5], float(limits_mm[0]))
