@@ -145,11 +145,10 @@ class _Known:
         """Return what the model says of rays through points [2, N] of a plane, which rise by slopes [2, N]."""
         pupil = point + slope * (self.model.domain.pupil_z_mm - z_mm)
         some = [*np.broadcast_arrays(point, pupil), np.broadcast_to(nm, (1, pupil.shape[1]))]
-        rows = np.concatenate(some, dtype=np.float64 if self.run is None else np.float32)
         if self.run is None:
-            found = evaluate(self.graph, {"rays": rows, "film_z_mm": np.full((1, 1), z_mm)})
+            found = evaluate(self.graph, {"rays": np.concatenate(some), "film_z_mm": np.full((1, 1), z_mm)})
             return {name: np.broadcast_to(a, (len(a), pupil.shape[1])) for name, a in found.items()}
-        self.run.numbers[:] = z_mm
+        self.run.numbers[:], rows = z_mm, np.concatenate(some, dtype=np.float32)
         return {name: a.astype(np.float64) for name, a in self.run({"rays": rows}).items()}
 
     def pupils(self, place: Array, count: int = _FEW) -> list[list[ExitPupil | None]]:
