@@ -21,9 +21,10 @@ _CHECKED = {"certain": "photographs", "likely": "photographs, a likely match"}
 @dataclass(frozen=True, kw_only=True)
 class Find(cli.Reporting):
     """Find lenses of the library by words: product, maker, focal length, f-number, mount, year or decade, nickname,
-    kind (zoom, prime, macro, fisheye, tilt, shift, anamorphic), and what a lens is known for (swirl, bubbles, soft,
-    flare, cat's eye: the strongest first). Accents and capitals do not matter. Where no lens has all words, the three
-    nearest are shown. --json adds each lens's file, its drawing and its figures.
+    kind, and what a lens is known for. Kinds are zoom, prime, macro, fisheye, tilt, shift and anamorphic; lenses are
+    known for swirl, bubbles, soft, flare and cat's eye, and the strongest come first. Accents and capitals do not
+    matter. Where no lens has all words, the three nearest are shown. --json adds each lens's file, its drawing and its
+    figures.
 
     Every command takes such words where it takes a lens, if one lens is meant by them."""
 

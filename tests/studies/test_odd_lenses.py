@@ -130,9 +130,9 @@ def test_a_run_folder_is_all_that_evaluate_needs(
 
 
 def test_a_film_stated_beyond_the_light_ends_with_it(tmp_path: Path) -> None:
-    """A stated field of 59 degrees, more than the rims leave: models are of the lit film, and load."""
+    """A stated image circle wider than the rims leave light: models are of the lit film, and load."""
     path = written(tmp_path, "triplet", *ODD["triplet_5mm"])
-    path.write_text(path.read_text().replace("rims =", "half_field_deg = 59\nrims ="))
+    path.write_text(path.read_text().replace("rims =", "image_radius_mm = 8.3\nrims ="))
     experiment = default_experiment(path)
     lens = experiment.lens.read()
     with pytest.warns(match="dark beyond .* mm: models are of what is lit"):

@@ -285,11 +285,9 @@ def _by_rays(
     both = np.repeat(np.eye(cells, dtype=np.float32), fold, 1)
     light = both @ light @ both.T
     hits = summed(slopes(pupils).astype(np.float32), (middles(cells),) * 2)
-    column, row = (
-        np.floor((hits - np.array([x_mm[:, 0], y_mm[:, 0]], np.float32).T[..., None, None]) / pixel_mm + 0.5)
-        .astype(np.int32)
-        .swapaxes(0, 1)
-    )
+    places = (hits - np.array([x_mm[:, 0], y_mm[:, 0]], np.float32).T[..., None, None]) / pixel_mm + 0.5
+    # Integers hold no place that is kilometres aside, where the series of a pupil may end beyond its edges.
+    column, row = np.floor(places).clip(-1, max(rows, columns)).astype(np.int32).swapaxes(0, 1)
     met = (column >= 0) & (column < columns) & (row >= 0) & (row < rows) & (light > 0)
     place = (np.arange(count)[:, None, None] * rows + row) * columns + column
     return np.asarray(np.bincount(place[met], light[met], count * rows * columns).reshape(count, rows, columns))
