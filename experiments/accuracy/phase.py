@@ -105,7 +105,8 @@ def _strehl(pupil: ExitPupil) -> float:
     field = cells_of(pupil, _CELLS)
     reach = max(4e-6 * pupil.wavelength_nm / float(pupil.half.max()), pupil.blur_mm)
     line = np.linspace(-reach, reach, 2 * _CELLS + 1)
-    return float(irradiance(pupil, line, line, field).max()) / perfect_peak(pupil, field)
+    peak = perfect_peak(pupil, field)  # 0 where the pupil of a condenser's model is all beyond its rims
+    return float(irradiance(pupil, line, line, field).max()) / peak if peak else 0.0
 
 
 def _off(row: Row) -> float | None:

@@ -54,8 +54,9 @@ from neurolens.optics.trace.surfaces import Rays
 
 TERMS, FINE_WAVES = 120, 0.0015  # at most, and the RMS at which no term is added
 # Where all terms leave more than the first RMS, and less than the second, a network of two layers stands beside them.
-# It is fitted to what this share of the terms leaves, which is smoother than what all leave: of that it learns half or
-# nothing. It trains for a minute on one core, and is kept where it helps the rays that it has not seen.
+# One is fitted to what this share of the terms leaves, which is smoother than what all leave, and another one to that:
+# which of them learns more differs from lens to lens. Each trains for a minute on one core. The one that helps the rays
+# that it has not seen most is kept, and none if none does.
 ENOUGH_WAVES, _MOST_WAVES = 0.01, 1.0
 _UNITS, _STEPS, _SMOOTH, _SEEN = 24, 160, 5 / 12, (7, 8)
 # Where they leave more, rays count by their blur on the film, half at this: where there is no image, a small share of
@@ -104,12 +105,12 @@ def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
         if off >= _MOST_WAVES:
             exponents, path, _ = _polynomial(model, _known(model, core, _towards_axis(model, rays), _SHARP_UM), TERMS)
         elif off > ENOUGH_WAVES:
-            _, _, smooth = _polynomial(model, fit, int(_SMOOTH * TERMS))
-            seen = len(rays) * _SEEN[0] // _SEEN[1]
-            network, taken = _network(variables, smooth, weights, unit, seen)
-            beside = _polynomial(model, (variables, wanted - taken, weights), TERMS)
-            if float((beside[2] * weights)[:, seen:].norm()) < float((left * weights)[:, seen:].norm()):
-                (exponents, path, _), rest = beside, network
+            seen, all_leave = len(rays) * _SEEN[0] // _SEEN[1], left
+            for given in (_polynomial(model, fit, int(_SMOOTH * TERMS))[2], all_leave):
+                network, taken = _network(variables, given, weights, unit, seen)
+                beside = _polynomial(model, (variables, wanted - taken, weights), TERMS)
+                if float((beside[2] * weights)[:, seen:].norm()) < float((left * weights)[:, seen:].norm()):
+                    (exponents, path, left), rest = beside, network
     return replace(model, core=replace(core, exponents=exponents, path=path, rest=rest))
 
 

@@ -145,7 +145,7 @@ def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.flo
     w, i, j = np.unravel_index(edge, count.shape)
     corner = (w * (cells + 1) + i) * (cells + 1) + j
     ends = at.reshape(*at.shape[:2], -1).take(np.add.outer(corner, [0, cells + 1, 1, cells + 2]), 2)
-    cuts = ((ends * ends).sum(1).max((1, 2)) > (limits * limits).min(1)) | (np.arange(len(limits)) == 0)
+    cuts = ((ends * ends).sum(1).max((1, 2), initial=0) > (limits * limits).min(1)) | (np.arange(len(limits)) == 0)
     inside = _lets(aperture, limits[cuts][:, w], ends[cuts] @ _WAYS).astype(np.float32)
     whole = (count == 4).astype(np.float32)
     shape, aside = (len(pupils), cells + 2, cells + 2), np.outer(np.arange(3) * (cells + 2), [1, 1, 1]) + np.arange(3)

@@ -196,6 +196,16 @@ def test_twice_as_many_cells_give_the_same_image() -> None:
     assert images[0] == pytest.approx(images[1], abs=3e-3 * images[1].max())
 
 
+@pytest.mark.parametrize(("wide", "share"), [(1e-9, 0.0), (1e9, 1.0)])
+def test_a_pupil_whose_rims_cut_no_cell_is_closed_or_the_whole_box(wide: float, share: float) -> None:
+    """Its image has no light then, or all that the box lets through."""
+    pupil = pupil_of(library("laikin_double_gauss_50", f_number=4.0))
+    pupil = replace(pupil, limits_mm=tuple(wide for _ in pupil.limits_mm))
+    assert np.all(pupil.open_share(64) == share)
+    found = spread([pupil], ONE, 0.003, 33)
+    assert float(found.inside[0]) <= share and bool(found.pupil[0]) is bool(share)
+
+
 def test_a_lens_without_symmetry_or_power_is_refused_and_a_dark_place_is_dark() -> None:
     given = library("laikin_double_gauss_50")
     [[dark]] = pupils_at(given, np.array([[300.0, 0.0]]), [D])
