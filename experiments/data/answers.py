@@ -697,7 +697,7 @@ def pictures() -> Answer:
     )
 
 
-# Of labels that would stand upon others, in points.
+# Labels that would cover others are moved by so many points, right and up.
 PLACES = {"garden": (-14, -12), "studio": (5, -11), "lamps": (-34, -3), "chess": (5, 5), "lights": (6, -8)}
 
 

@@ -84,7 +84,7 @@ def fit_model(
 
     Args:
         checkpoint: file in which the training of networks keeps its state, to go on from there after a kill (see
-            `fit_network`). It stays when the fit has ended, for whoever asked for it to remove.
+            `fit_network`). The fit does not remove the file when it ends: the caller does.
 
     Raises:
         InputError: an unknown method, or settings that the method refuses.

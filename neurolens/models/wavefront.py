@@ -38,8 +38,9 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays
 
 _RAYS = 24  # along a side of the box about what passes
-# Pupils fill ellipses in their boxes, in which rays are taken: in two spirals of half the golden angle, as many in each
-# part. Ellipses lean by the correlation of x and y, of which few steps are told apart, so that fits are kept.
+# A pupil fills an ellipse in its box. Its rays lie on two spirals there, which turn by half the golden angle from ray
+# to ray, so that equal areas hold equally many. How far the ellipse leans is rounded to a few steps: pupils that lean
+# alike share the matrix of their fit, which is kept.
 _ELLIPSE, _LEANS, _FEW, _MANY = 0.96, 32, 256, 800
 _ENOUGH = 240  # of the few rays: where rims shut out more, many are taken
 _ROOM = 1.1  # the ellipse over what passes
@@ -170,8 +171,9 @@ class _Known:
         foot, leaves, _ = foot_of(self.core, first["ray"])
         source = None if source is None else each(source)
         way = axis if source is None else (source - foot) / np.linalg.norm(source - foot, axis=0)
-        # Rays of the source, by cosines: where those that leave so much aside come from. Then those with s(P) = d, or
-        # between both, where they come from far: rays outside its pupil are none that the model knows.
+        # `led` are the points where rays of the source cross the focal plane: rays that leave so much aside come from
+        # so much beside. `even` are the points with s(P) = d, whose path counts. Where they lie far away, a point on
+        # the way is taken, for the model knows no rays outside its pupil.
         met, left = np.split(self._point_of(np.concatenate([way, leaves], 1)), 2, 1)
         led, many = point + met - left, (np.tile(slope, waves), focal_z, np.repeat(self.waves, places * count))
         apart = (met - led) / self.model.domain.pupil_radius_mm
@@ -234,11 +236,9 @@ class _Known:
         """Return the object points [3, P] on chief rays [6, P], from the front focal point; None for distant ones."""
         back = np.concatenate([seen[:3], -seen[3:]])  # light travels to the film
         found = self.scene.object_points(Rays(*torch.from_numpy(back)))
-        return (
-            None
-            if found is None
-            else np.stack([c.numpy() for c in found]) - np.array([[0], [0], [self.core.front_z_mm]])
-        )
+        if found is None:
+            return None
+        return np.stack([c.numpy() for c in found]) - np.array([[0], [0], [self.core.front_z_mm]])
 
     def _box(self, place: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Return boxes of cosines about the ellipses that hold the light, and which places have any.

@@ -63,7 +63,7 @@ def check_lens(lens: Lens) -> list[Check]:
     corner.
     """
     data = first_order(lens)
-    # Of an object near the lens, whose film and blur are not those at infinity; its state is checked below.
+    # The table of a near object has its own film, not that of infinity: its blur is checked below, in its state.
     near = any(c.object_distance_mm is not None and not c.thickness_mm for c in lens.configurations)
     found = [*_first_order(lens, data, near=near), _beam(lens, data), _edges(lens), *_field(lens)]
     if data.efl_mm > 0:

@@ -343,9 +343,10 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
     """Return the radius (mm) of the lit film, and where it comes from.
 
-    It is the file's own. Without one it follows from the half field: below 60 degrees it is f tan(half field), beyond
-    that, and where no such light or that of much wider fields falls there, the film radius whose passing rays leave, in
-    the mean, at the half field. Without a half field it is where the relative illumination falls to 10%.
+    It is the file's own. Without one it follows from the half field: below 60 degrees it is f tan(half field). Where no
+    light falls there, or light of much wider fields, and from 60 degrees on, it is the film radius whose passing rays
+    leave, in the mean, at the half field. Without a half field, and where rims cut the light before it, it is where the
+    relative illumination falls to 10%.
     """
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm, "the lens file"

@@ -70,12 +70,12 @@ def require_mitsuba(variant: str | None = None) -> Any:
     """Import the module mitsuba with a variant set: `variant`, else the current one, else llvm_ad_spectral.
 
     Warns:
-        NeurolensWarning: no variant was asked for, and scalar_spectral is taken, for there is no LLVM, or one so old
-            that compiled variants end the process.
+        NeurolensWarning: LLVM is missing, or so old that compiled variants end the process. Where no variant was asked
+            for, scalar_spectral is taken.
 
     Raises:
-        NeurolensError: Mitsuba is not installed, or the compiler of the variant that was asked for (LLVM, CUDA) is
-            missing or too old.
+        NeurolensError: Mitsuba is not installed, or a variant was asked for whose compiler (LLVM, CUDA) is missing or
+            too old.
         InputError: this Mitsuba does not have the variant, or the variant carries neither RGB nor plain spectra.
     """
     mi, dr = libraries()
