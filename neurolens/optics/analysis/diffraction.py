@@ -5,9 +5,9 @@ the exit pupil (`exit_pupil`; Debye; Born and Wolf, section 8.8). Here it is sum
 which those on the edge of a rim or a blade count by their open share, as two products of matrices. |U|^2 integrates to
 the light that arrives, so that shares of it need no scale. A pixel takes the mean over its area.
 
-Far out of focus the fringes are finer than pixels, and the grid would need too many cells. There the rays of the same
-pupil are counted by pixels (`Spread.by_rays`). Where both are known, `Spread.differs` tells how much light they place
-in different pixels: some 6% of white light on pixels of 3 um, where rays take over at f/2.8.
+Far out of focus the fringes are finer than pixels, and the grid would need too many cells for the rays of the place
+themselves. There these are counted by pixels (`Spread.by_rays`). Where both are known, `Spread.differs` tells how much
+light they place in different pixels: some 6% of white light on pixels of 3 um, where rays take over at f/2.8.
 """
 
 from __future__ import annotations
@@ -138,6 +138,11 @@ def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
     return max(_FEWEST, 8 * math.ceil(_PER_CYCLE * cycles / 8))
 
 
+def _resolved_mm(pupil: ExitPupil) -> float:
+    """Return how far from the centre the finest grid resolves diffraction, the inverse of `cells_needed`."""
+    return FINEST / _PER_CYCLE * pupil.wavelength_nm * 1e-6 / (2 * float(pupil.half.max())) - pupil.blur_mm
+
+
 def reach_of(pupils: Sequence[ExitPupil | None]) -> float:
     """Return how far (mm) a window must reach from its centre to hold the rays and six Airy radii."""
     some = [p for p in pupils if p is not None]
@@ -159,19 +164,26 @@ def _centre(pupils: Sequence[ExitPupil]) -> Array:
 def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, side: int) -> Spread:
     """Return the point spread of a place.
 
+    Where the finest grid does not resolve the corners of the pixels, but the place's own rays and six Airy radii, the
+    pixels beyond what it resolves stay dark.
+
     Args:
         pupils: by wavelength; None is dark. weights: [C, W] of wavelengths in each channel.
         pixel_mm, side: pixels, and how many along a side.
     """
     lit = [k for k, p in enumerate(pupils) if p is not None]
     some, weights = [p for p in pupils if p is not None], weights[:, lit]
-    centre, reach = _centre(some), side * pixel_mm / 2 * math.sqrt(2)
+    centre = _centre(some)
     if not some:
         dark = np.zeros(len(weights))
         return Spread(np.zeros((len(weights), side, side)), centre, dark, dark, False, math.nan)
-    needed = [cells_needed(p, reach + math.dist(p.centre_mm, centre)) for p in some]
+    aside = [math.dist(p.centre_mm, centre) for p in some]
+    corner_px = min(_resolved_mm(p) - a for p, a in zip(some, aside, strict=True)) * math.sqrt(2) / pixel_mm
+    unseen = max(math.ceil((side - corner_px) / 2), 0)  # pixels on each side of the window
+    by_rays = unseen > 0 and side - 2 * unseen < 2 * reach_of(some) / pixel_mm
+    reach = (side - 2 * unseen) * pixel_mm / math.sqrt(2)
+    needed = [cells_needed(p, reach + a) for p, a in zip(some, aside, strict=True)]
     rays = 32 * math.ceil(max(p.blur_mm for p in some) / pixel_mm / 4)  # across the pupil, to be counted by pixels
-    by_rays = max(needed) > FINEST
     if by_rays:
         needed = [min(max(_FEWEST, rays), _MOST_CELLS)] * len(some)
     line = (np.arange(side) - (side - 1) / 2) * pixel_mm
@@ -186,7 +198,9 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
         fold = max(k for k in (1, 2, 4) if k == 1 or cells // k >= max(rays, _FEWEST // 2))
         counted = spent = _by_rays(group, x, y, pixel_mm, light * share, fold) * area[:, None, None]
         if not by_rays:
-            spent = by_pixel(group, x, y, pixel_mm, phasor(cycles, np.sqrt(light) * weight))
+            seen = slice(unseen, side - unseen)
+            spent = by_pixel(group, x[:, seen], y[:, seen], pixel_mm, phasor(cycles, np.sqrt(light) * weight))
+            spent = np.pad(spent, [(0, 0), (unseen, unseen), (unseen, unseen)])
         parts.append((counted, spent, *((s.sum((1, 2), dtype=np.float64) * area) for s in (light * share, share))))
     *images, total, solid = (np.concatenate(part) for part in zip(*parts, strict=True))
     energy = weights @ total
