@@ -89,7 +89,7 @@ def fit_network(
         OSError: the checkpoint cannot be written.
     """
     if not len(data.pairs.train):
-        raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
+        raise InputError("settings", "pairs.train", "(no rays)", "at least one passing ray")
     with pinned_threads():
         problem, shift, scale = _problem(data, base)
         decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seed")}

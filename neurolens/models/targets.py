@@ -419,8 +419,8 @@ def prepare(pairs: RayPairs) -> Prepared:
     lost = float(untold.double().sum()) / len(drawn)
     if lost > 1e-4:
         warnings.warn(
-            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total "
-            "reflection in a way that no gate shows; the rims near by stand in for that boundary",
+            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays miss a surface or are totally "
+            "reflected where no gate of the model says so; there the model blocks by the nearest rims",
             NeurolensWarning,
             stacklevel=2,
         )

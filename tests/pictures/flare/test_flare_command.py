@@ -228,7 +228,7 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
     np.testing.assert_allclose(plain @ matrix, ghosts, atol=1e-4 * ghosts.max())
     scene.write_text(SCENE.replace('coating = "single-layer"\n', ""))  # a pinhole has no glass
     assert main(["render", str(scene), "--camera", "pinhole", "-o", str(out), "--layers", "beauty"]) == 0
-    assert read_layers(out) == {} and "no flare of" in capsys.readouterr().err
+    assert read_layers(out) == {} and "no flare: " in capsys.readouterr().err
     for table, said in (("bins = 0", "flare.bins"), ('without = ["x"]', "without"),
                         ("speed = 2", "flare.speed")):  # fmt: skip
         scene.write_text(SCENE.partition("[flare]")[0] + f"[flare]\n{table}\n")
