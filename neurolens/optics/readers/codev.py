@@ -61,6 +61,7 @@ READ = (
     *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM DAR REV".split(),
     *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0, *TURNS, *SOLVES),
 )
+NO = ("N", "NO")
 ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
 # Control codes, fields, vignetting factors, weights and wavelengths, which move no ray in a zoom.
 NOT_ZOOMED = frozenset(
@@ -192,7 +193,7 @@ def _system(file: File, command: Command) -> bool:
     name, words, line = command.name, command.words, command.line
     match name:
         case "RDM":
-            file.radii = not (words and words[0].upper() in ("N", "NO"))
+            file.radii = not (words and words[0].upper() in NO)
         case "TIT" if words and words[0].upper().startswith("Z") and words[0][1:].isdecimal():
             file.zoom.titles[int(words[0][1:]) - 1] = " ".join(words[1:]).strip("\"' ")
         case "TIT":
@@ -242,8 +243,8 @@ def _surface(file: File, command: Command) -> None:
     match name:
         case "STO":
             block.stop = True
-        case "PIM":
-            block.solved = True
+        case "PIM":  # behind the image, too, it speaks of the last surface
+            file.blocks[-2 if file.closed else -1].solved = not (words and words[0].upper() in NO)
         case "GLA":
             block.medium = medium(command, words, file.private)
         case "SPS" | "SCO":

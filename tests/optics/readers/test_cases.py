@@ -324,7 +324,8 @@ def heard_text(text: str, tmp_path: Path) -> tuple[Lens, str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "n_d"), [("SSK4", 1.6177), ("LEXAN", 1.5855), ("Plexiglas", 1.4918), ("STYRON", 1.591)]
+    ("name", "n_d"),
+    [("SSK4", 1.6177), ("LEXAN", 1.5855), ("Plexiglas", 1.4918), ("STYRON", 1.591), ("F_SILICA", 1.4585)],
 )
 def test_old_glasses_and_trade_names_are_known(name: str, n_d: float, tmp_path: Path) -> None:
     lens, _ = heard_text(swapped("GLAS N-BK7", f"GLAS {name}"), tmp_path)
