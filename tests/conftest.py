@@ -59,6 +59,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     gc.freeze()  # what is imported and collected stays: no need to look through it again and again
+    gc.set_threshold(50_000)  # graphs are tens of thousands of tuples, of which few are garbage
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -67,7 +68,7 @@ def quick_races() -> Iterator[None]:
     judges a clock."""
     flags = ("-std=c99", "-O0", "-march=native")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-O1") for flag in compiler.FLAGS))
+        patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-Og") for flag in compiler.FLAGS))
         # What is compiled and searched for one test is there for the next, in both processes.
         patch.setattr(compiler, "_KEPT", 4096)
         patch.setattr("neurolens.cameras.exact._KEPT", 4096)
