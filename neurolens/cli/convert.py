@@ -136,7 +136,7 @@ class Converted(Report):
             f"surfaces      {self.surfaces}, stop on {self.stop_surface}; rims: {self.rims}",
             f"focal length  {efl}{across}",
             f"back focus    {back}; film tabled at {gap}",
-            f"f-number      f/{cli.number(self.f_number)}, stated f/{cli.number(self.stated_f_number)}",
+            f"f-number      f/{cli.number(self.f_number)} by its stop, named f/{cli.number(self.stated_f_number)}",
             f"wavelength    {', '.join(cli.first_order_light(self.light))}",
             *([f"states        {', '.join(self.configurations)}"] if self.configurations else ()),
             *(f"warning: {text}" for text in self.warnings),

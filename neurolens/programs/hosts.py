@@ -227,7 +227,7 @@ def rays(
     )
     try:
         if film is None:
-            film, _ = film_of(camera, **Shot.part(**settings).size)
+            film, _ = film_of(os.fspath(camera), **Shot.part(**settings).size)
         film = check_film(film)
     except (TypeError, InputError):
         raise InputError("rays", "film", film, f"a width and a height, each {said(FILM_MM)} mm") from None
