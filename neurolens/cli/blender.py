@@ -66,7 +66,7 @@ class Blender(cli.Command):
 class Build(cli.Reporting):
     """Pack the extension with a folder of models and with the lens files of the folder lenses/ beside it: of each
     lens the best polynomial, the best network and the exact lens, every surface traced.
-    What cannot be a shader is left out and said.
+    What cannot be a shader is left out, and named.
 
     Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
 
