@@ -208,7 +208,7 @@ def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") 
     glasses = same_name(name)
     if not glasses:
         reason = _REFUSED.get(_key(name)) or _suggestion(name)
-        raise InputError(file, where, name, f"a glass of the catalogue; {reason}")
+        raise InputError(file, where, name, f"a glass of the catalogue, or of one given by --glass; {reason}")
     return glasses[0]
 
 

@@ -41,6 +41,7 @@ REFUSED = by_word(
     ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
     ("GRN", "a medium without a gradient index"),
     ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
+    ("INT", "a surface without a file of its deformations"),
     ("RMD", "a surface that refracts: the lens model has no mirrors"),
     ("BEN RET GLB", "tilts and decentres by XDE to CDE, DAR and REV: a bend belongs to a mirror"),
     ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),

@@ -212,6 +212,9 @@ def _complete(file: File) -> None:
     file.rows = placed([_row(block) for block in middle], file.blocks[1:])
     file.object_medium, file.wavelengths_nm = first.medium, primary_first(waves_nm, waves_nm[0] if waves_nm else 0.0)
     file.object_distance = math.inf if distance >= INFINITE else distance
+    if file.pupil is not None and 0 < distance < INFINITE:  # EBR is measured at surface 1, not at the entrance pupil
+        slope = math.atan(file.pupil / 2 / distance)
+        file.object_na, file.pupil = first.medium.get("n_d", 1.0) * math.sin(slope), None
     file.film_given = not (last.solved and "TH" not in last.values)
 
 

@@ -332,6 +332,12 @@ def test_old_glasses_and_trade_names_are_known(name: str, n_d: float, tmp_path: 
     assert lens.surfaces[0].n_d == pytest.approx(n_d, abs=1e-3)
 
 
+def test_an_archive_says_what_to_give_instead(tmp_path: Path) -> None:
+    (tmp_path / "lens.zar").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match=r"an archive of Zemax; give the lens file \(.zmx\)"):
+        read_any(tmp_path / "lens.zar")
+
+
 def test_a_matrix_of_polarisation_moves_no_ray(tmp_path: Path) -> None:
     text = swapped("TYPE STANDARD\n  CURV -2", "TYPE JONESMAT\n  PARM 1 1\n  PARM 8 0.5\n  CURV -2")
     lens, told = heard_text(text, tmp_path)

@@ -217,6 +217,7 @@ def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -
         ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'NBK8'.*N-BK7"),
         ("NBK7_SCHOTT", "REFL", r"line 12, S: got 'REFL'.*no mirrors"),
         ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),
+        ("  STO", "  INT worn.int", r"line 14, INT: got 'worn.int', expected.*deformations"),
         ("  STO", "  GRT", r"line 14, GRT: got .*given.*no grating"),
         ("  STO", "  STO; XOD 3", r"line 14, XOD: got 3.0, expected 0"),
         ("  STO", "  STO; SPS QBF", r"NRADIUS of SPS QBF: got 0.0, expected a normalisation radius above 0"),
