@@ -122,8 +122,8 @@ examples:
             write: Callable[[Path], Exported] = self._write_osl
         elif self.whole_camera or not is_model(file):
             if self.to == "onnx" or not whole:
-                what = "(a whole camera)" if self.whole_camera else "(a lens file)"
-                self.refuse(str(file), what, "a model, beside --to onnx, --fix or --only; or none of these")
+                what = "a camera" if self.whole_camera else "a lens file"
+                self.refuse(str(file), f"({what})", "source code (--to c, glsl ...), without --fix, --only")
             write = self._write_camera if self.whole_camera else self._write_lens
         else:
             write = partial(self._write_model, fixed=fixed)

@@ -148,12 +148,16 @@ examples:
 
             plot_point_spread(arrays, self.pixel_um, self.plot, lens.name, facts["channels"])
         count = int(np.prod(arrays["psf"].shape[:4]))
-        inside = float(arrays["inside"].min())
+        lit = arrays["light"] > 0
+        inside = float(arrays["inside"][lit].min(initial=1))
         found = Spread(
             file=str(self.out), lens=lens.lens_id, psfs=count, side_px=arrays["psf"].shape[-1], channels=list(waves),
             by_rays=int(arrays["by_rays"].sum()), plot=None if self.plot is None else str(self.plot),
             least_inside=inside, cpu_s_a_psf=None if self.dask else (time.process_time() - began) / count,
         )  # fmt: skip
+        if not lit.all():
+            unknown = ", or the model knows no image there: trace the lens file" if loaded else ""
+            note(f"{count - int(lit.sum())} of {count} point spreads are dark: no light arrives{unknown}")
         if inside < 0.9:
             note(f"at some places {1 - inside:.0%} of the light lies beyond {found.side_px} pixels")
         return self.answer(found)

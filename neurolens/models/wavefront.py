@@ -38,13 +38,15 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.surfaces import Rays
 
 _RAYS = 24  # along a side of the box about what passes
+_ABOUT = 2.0  # half sides of its first guess, in radii of the stop as the whole pupil has them
+_GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, _RAYS)] * 2)).reshape(2, 1, -1)
 # A pupil fills an ellipse in its box. Its rays lie on two spirals there, which turn by half the golden angle from ray
 # to ray, so that equal areas hold equally many. How far the ellipse leans is rounded to a few steps: pupils that lean
 # alike share the matrix of their fit, which is kept.
 _ELLIPSE, _LEANS, _FEW, _MANY = 0.96, 32, 256, 800
 _ENOUGH = 240  # of the few rays: where rims shut out more, many are taken
 _ROOM = 1.1  # the ellipse over what passes
-_AT_ONCE = 4  # places whose rays are evaluated in one go
+_AT_ONCE = 16  # places whose rays are evaluated in one go
 _FAR_UM = 1e30
 # Graphs of models, and the same compiled where the machine has a compiler.
 _KNOWN: WeakKeyDictionary[Phased, tuple[Graph, CompiledGraph | None]] = WeakKeyDictionary()
@@ -84,7 +86,7 @@ def model_pupils(
 
     Args:
         scene: the model's lens, stopped down and focused, with the distance of its object.
-        places_mm: [P, 2] x and y on the film; those beyond the model's film are dark.
+        places_mm: [P, 2] x and y on the film; those beyond the model's film are dark, and those that have no image.
 
     Raises:
         InputError: as `checked_path`.
@@ -156,7 +158,7 @@ class _Known:
         """Return the pupils of film places [2, P], by place and wavelength, from so many rays; None without light."""
         film_z, focal_z, stop_mm = self.scene.film_z_mm, self.core.focal_z_mm, self.scene.lens.stop_radius_mm
         chief, seen = self._chief(place)
-        middle, half, lean, lit = self._box(place)
+        middle, half, lean, lit = self._box(place, chief)
         places, waves, points = place.shape[1], len(self.waves), [_spirals(count, c) for c in lean.tolist()]
 
         def each(values: Array) -> Array:
@@ -214,7 +216,9 @@ class _Known:
                 self.scene.lens.aperture, self.waves, (place[:, k], middle[:, k], half[:, k]), points[k], shows,
                 rows.reshape(-1, waves, places, count)[:, :, k], limits,
             )  # fmt: skip
-            found.append(made or [None] * waves)
+            # Where by the path a point's light covers more than the film, there is no image, and the path errs by far.
+            known = made and all(p.blur_mm <= self.model.domain.film_radius_mm for p in made if p)
+            found.append(made if made and known else [None] * waves)
         return found
 
     def _chief(self, place: Array) -> tuple[Array, Array]:
@@ -228,7 +232,9 @@ class _Known:
             slope = (tried - radius[:, None]) / back
             steep = ways * slope.reshape(-1)
             out = self.rays(np.repeat(place, _SEARCH, 1), steep, self.scene.film_z_mm, self.waves[0])
-            best = np.abs((ways * out["stop"]).sum(0)).reshape(slope.shape).argmin(1)
+            # Far outside the lens a model may fold, and say that rays meet the middle of the stop there.
+            folded = (out.get("gates", np.zeros((1, 1))) > _NEAR**2 - 1).any(0) * self.model.domain.stop_radius_mm
+            best = (np.abs((ways * out["stop"]).sum(0)) + folded).reshape(slope.shape).argmin(1)
             ends = tried[every, np.clip(best + [[-1], [1]], 0, _SEARCH - 1)]
         return along * slope[every, best], out["ray"].reshape(6, *slope.shape)[:, every, best]
 
@@ -240,18 +246,23 @@ class _Known:
             return None
         return np.stack([c.numpy() for c in found]) - np.array([[0], [0], [self.core.front_z_mm]])
 
-    def _box(self, place: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    def _box(self, place: Array, chief: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Return boxes of cosines about the ellipses that hold the light, and which places have any.
 
         They are middles and half sides [2, P], and the correlation of x and y in the ellipses [P].
         """
         domain, lens, film_z = self.model.domain, self.scene.lens, self.scene.film_z_mm
-        low, high = (np.full(place.shape, sign * domain.pupil_radius_mm) for sign in (-1, 1))
-        share = np.stack(np.meshgrid(*[np.linspace(0, 1, _RAYS)] * 2)).reshape(2, 1, -1)
+        # A closed stop would lie between rays over the whole pupil of the domain.
+        reach = _ABOUT * domain.pupil_radius_mm * lens.stop_radius_mm / domain.stop_radius_mm
+        middle = place + chief * (domain.pupil_z_mm - film_z)
+        low, high = (np.clip(middle + r, -domain.pupil_radius_mm, domain.pupil_radius_mm) for r in (-reach, reach))
+        # Wavelengths take turns from ray to ray: through a closed stop their light leaves in different boxes.
+        turns = np.add.outer(np.arange(_RAYS), np.arange(_RAYS)).reshape(-1) % len(self.waves)
+        nm = np.tile(np.array(self.waves)[turns], place.shape[1])
         for _ in range(2):
-            pupil = low[..., None] + (high - low)[..., None] * share
+            pupil = low[..., None] + (high - low)[..., None] * _GRID
             slope = (pupil - place[..., None]) / (domain.pupil_z_mm - film_z)
-            rays = (np.repeat(place, share.shape[2], 1), slope.reshape(2, -1), film_z, self.waves[0])
+            rays = (np.repeat(place, _RAYS**2, 1), slope.reshape(2, -1), film_z, nm)
             lit = self._passes(self.rays(*rays), pupil.reshape(2, -1), lens.stop_radius_mm).reshape(pupil.shape[1:])
             step, count = (high - low) / (_RAYS - 1), np.maximum(lit.sum(1), 1)
             ends = np.where(lit, pupil, np.inf).min(-1) - step, np.where(lit, pupil, -np.inf).max(-1) + step

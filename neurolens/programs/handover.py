@@ -395,9 +395,9 @@ class FittedProjection:
 
 
 def fitted_projection(
-    kind: str | None, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
+    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
 ) -> tuple[projections.Projection, projections.Residual, FittedProjection]:
-    """Fit a projection, of a `kind` as in `projections.fit`, to a field; return it, what it leaves, both as figures.
+    """Fit a projection to a field; return the projection, what it leaves, and both as figures.
 
     Raises:
         InputError: as `projections.fit`.

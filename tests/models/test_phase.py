@@ -159,17 +159,37 @@ def test_files_keep_it_and_every_form_gives_it(
         _swap(file, replace(model, core=broken))
 
 
-def test_more_terms_take_what_few_leave(
-    both: tuple[LensModel, LensModel], fresh: FilmRays, monkeypatch: pytest.MonkeyPatch
+def test_a_network_takes_what_few_terms_leave(
+    both: tuple[LensModel, LensModel], fresh: FilmRays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rays = passing_rays(both[0].lens, both[0].domain, 4000, seed=5, batch=8192).inputs
+    """The error falls; the file, compiled C and the model of one wavelength have it."""
+    plain = both[0]
+    rays = passing_rays(plain.lens, plain.domain, 4000, seed=5, batch=8192).inputs
     monkeypatch.setattr(phase, "TERMS", 12)
+    monkeypatch.setattr(phase, "_UNITS", 8)
+    monkeypatch.setattr(phase, "_STEPS", 40)
     monkeypatch.setattr(phase, "_MOST_WAVES", math.inf)
-    few, more = (with_phase(both[0], rays, most) for most in (12, 24))
-    assert isinstance(few.core, Phased) and isinstance(more.core, Phased)
-    assert len(few.core.path) == 12 and 12 < len(more.core.path) <= 24
-    errors = [path_errors(model, fresh)["phase_rms_waves"] for model in (few, more)]
+    errors, models = [], list[LensModel]()
+    for enough in (math.inf, phase.ENOUGH_WAVES):
+        monkeypatch.setattr(phase, "ENOUGH_WAVES", enough)
+        models += as_stored([with_phase(plain, rays)])
+        errors.append(path_errors(models[-1], fresh)["phase_rms_waves"])
     assert errors[0] > 0.3 and errors[1] < 0.4 * errors[0]
+    few, model = models
+    assert isinstance(few.core, Phased) and isinstance(model.core, Phased) and model.core.rest is not None
+    assert few.core.rest is None and model.core.coefficients == few.core.coefficients + model.core.rest.coefficients
+    export_onnx(model, tmp_path / "net.onnx", {})
+    rays = replace(fresh, film_z=torch.full_like(fresh.film_z, model.domain.film_z_mm[0]))
+    inputs = {"rays": rays.rows.numpy(), "film_z_mm": rays.film_z[None, :1].numpy()}
+    calls = inputs | {"stop_radius_mm": np.full((1, 1), model.domain.stop_radius_mm)}
+    wanted = evaluate(model.graph, calls)["path_um"]
+    assert np.array_equal(evaluate(read_model(tmp_path / "net.onnx").at().graph, calls)["path_um"], wanted)
+    columns = dict(zip((*RAY, WAVELENGTH), inputs["rays"].astype(np.float32), strict=True))
+    numbers = {name: a.reshape(-1).astype(np.float32) for name, a in calls.items() if name != "rays"}
+    assert fused_program([model]).evaluate({**columns, **numbers})["path_um"] == pytest.approx(wanted[0], abs=0.01)
+    calls["rays"][4] = 550.0
+    one = evaluate(at_wavelength(model, 550.0).graph, calls)["path_um"]
+    assert one == pytest.approx(evaluate(model.graph, calls)["path_um"], abs=1e-6)
 
 
 def _swap(file: Path, model: LensModel) -> None:
@@ -197,13 +217,15 @@ def test_what_has_no_path_is_refused_by_name() -> None:
 
 
 def _strehl(pupil: ExitPupil, cells: int = 192) -> float:
-    field = cells_of(pupil, cells)
+    field = cells_of(pupil, (cells, cells))
     reach = max(4e-6 * pupil.wavelength_nm / float(pupil.half.max()), pupil.blur_mm)
     line = np.linspace(-reach, reach, 101)
     return float(irradiance(pupil, line, line, field).max()) / perfect_peak(pupil, field)
 
 
-@pytest.mark.parametrize(("f_number", "focus_m", "distance_m"), [(5.6, math.inf, math.inf), (8.0, 2.0, 1.9)])
+@pytest.mark.parametrize(
+    ("f_number", "focus_m", "distance_m"), [(5.6, math.inf, math.inf), (8.0, 2.0, 1.9), (32.0, math.inf, math.inf)]
+)
 def test_pupils_are_those_of_traced_rays(
     both: tuple[LensModel, LensModel], f_number: float, focus_m: float, distance_m: float
 ) -> None:
@@ -250,6 +272,21 @@ def test_a_condenser_has_the_strehl_ratio_of_its_middle(monkeypatch: pytest.Monk
     )  # fmt: skip
     assert exact is not None and found is not None and _strehl(exact) > 0.8
     assert _strehl(found) == pytest.approx(_strehl(exact), abs=0.01)
+    # Wide open and far from the axis its path sends light beyond the film: no image, rather than a wrong one.
+    wide = Scene(set_lens(plain.lens, Shot(film_mm=(60.0, 60.0), f_number=2.0)))
+    place = np.array([[0.7 * plain.domain.film_radius_mm, 0.0]])
+    assert model_pupils(model, wide, place, (546.0,)) == [[None]]
+
+
+def test_a_model_that_folds_beyond_its_rims_keeps_its_chief_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays that no rim would pass meet the middle of this model's stop, too, at 0.7 of the film."""
+    monkeypatch.setattr(phase, "TERMS", 10)
+    monkeypatch.setattr(phase, "ENOUGH_WAVES", math.inf)
+    plain = load_model(MODELS / "sony_sonnar_55.ols-64.onnx").fitted
+    model = with_phase(plain, passing_rays(plain.lens, plain.domain, 1500, seed=5, batch=8192).inputs)
+    scene = Scene(set_lens(plain.lens, Shot(film_mm=(36.0, 24.0))))
+    [[found]] = model_pupils(model, scene, np.array([[0.7 * plain.domain.film_radius_mm, 0.0]]), (546.0,))
+    assert found is not None and found.open_share(64).mean() > 0.5
 
 
 def test_a_model_gives_the_point_spread_of_its_lens(both: tuple[LensModel, LensModel]) -> None:

@@ -1,13 +1,14 @@
 """Point spread by diffraction, or by rays where diffraction no longer matters, on pixels of any size.
 
 The field about an image point is U(x, y) = 1/lambda times the integral of sqrt(e) exp(i k (W + L x + M y)) dL dM over
-the exit pupil (`exit_pupil`; Debye; Born and Wolf, section 8.8). Here it is summed over square cells of the pupil, of
-which those on the edge of a rim or a blade count by their open share, as two products of matrices. |U|^2 integrates to
-the light that arrives, so that shares of it need no scale. A pixel takes the mean over its area.
+the exit pupil (`exit_pupil`; Debye; Born and Wolf, section 8.8). Here it is summed over cells of the pupil, of which
+those on the edge of a rim or a blade count by their open part, as two products of matrices. |U|^2 integrates to the
+light that arrives, so that shares of it need no scale. A pixel takes the mean over its area.
 
-Far out of focus the fringes are finer than pixels, and the grid would need too many cells for the rays of the place
-themselves. There these are counted by pixels (`Spread.by_rays`). Where both are known, `Spread.differs` tells how much
-light they place in different pixels: some 6% of white light on pixels of 3 um, where rays take over at f/2.8.
+Far out of focus the fringes are finer than pixels, and the grid would need too many cells. There the rays of the same
+pupil are counted by pixels (`Spread.by_rays`): the light of a cell fills a rectangle, of which pixels have their
+shares. Where both are known, `Spread.differs` tells how much light they place in different pixels: some 6% of white
+light on pixels of 3 um, where rays take over at f/2.8.
 """
 
 from __future__ import annotations
@@ -38,11 +39,12 @@ from neurolens.optics.analysis.fields import Scene
 Field = NDArray[np.complex64]
 _RAYS = 36  # rays along a side of the rectangle about what is lit
 _WIDER = 1.1  # the rectangle over what is lit
-_PER_CYCLE = 2.5  # cells a cycle of the field needs
-_FEWEST, FINEST = 64, 512  # cells across the pupil: the edges need so many even in focus
+# Cells along a side of the pupil: for each cycle of the field, besides for its edges, and at most.
+_PER_CYCLE, _FEWEST, FINEST = 2.0, 24, 400
+_RAYS_PER_PIXEL, _FEWEST_RAYS = 1.5, 16  # across the pupil, where rays are counted
 _AT_ONCE = 2**17  # cells whose waves are summed in one go
 _RINGS = 6  # radii of the Airy disc that a window has at least
-_MOST_CELLS = 1024  # of the pupil along a side, whose rays are counted
+_MOST_CELLS = 512  # of the pupil along a side, whose rays are counted
 
 
 class Spread(NamedTuple):
@@ -132,15 +134,11 @@ def pupils_at(scene: Scene, places_mm: Array, wavelengths_nm: Sequence[float]) -
     return found
 
 
-def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
-    """Return the fewest cells across the pupil that resolve its diffraction out to `reach_mm` from the centre."""
-    cycles = 2 * float(pupil.half.max()) * (reach_mm + pupil.blur_mm) / (pupil.wavelength_nm * 1e-6)
-    return max(_FEWEST, 8 * math.ceil(_PER_CYCLE * cycles / 8))
-
-
-def _resolved_mm(pupil: ExitPupil) -> float:
-    """Return how far from the centre the finest grid resolves diffraction, the inverse of `cells_needed`."""
-    return FINEST / _PER_CYCLE * pupil.wavelength_nm * 1e-6 / (2 * float(pupil.half.max())) - pupil.blur_mm
+def cells_needed(pupil: ExitPupil, reach_mm: Array | float) -> tuple[int, int]:
+    """Return the fewest cells along both sides of the pupil that resolve its diffraction, out to `reach_mm` on each."""
+    cycles = 2 * pupil.half * (reach_mm + pupil.blurs_mm) / (pupil.wavelength_nm * 1e-6)
+    across, down = (4 * math.ceil((_FEWEST + _PER_CYCLE * c) / 4) for c in cycles.tolist())
+    return across, down
 
 
 def reach_of(pupils: Sequence[ExitPupil | None]) -> float:
@@ -164,43 +162,32 @@ def _centre(pupils: Sequence[ExitPupil]) -> Array:
 def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, side: int) -> Spread:
     """Return the point spread of a place.
 
-    Where the finest grid does not resolve the corners of the pixels, but the place's own rays and six Airy radii, the
-    pixels beyond what it resolves stay dark.
-
     Args:
         pupils: by wavelength; None is dark. weights: [C, W] of wavelengths in each channel.
         pixel_mm, side: pixels, and how many along a side.
     """
-    lit = [k for k, p in enumerate(pupils) if p is not None]
-    some, weights = [p for p in pupils if p is not None], weights[:, lit]
-    centre = _centre(some)
+    reach, centre = side * pixel_mm / 2, _centre([p for p in pupils if p is not None])
+    needed = {k: cells_needed(p, reach + np.abs(p.centre_mm - centre)) for k, p in enumerate(pupils) if p is not None}
+    lit = sorted(needed, key=lambda k: -max(needed[k]))
+    some, weights = [p for k in lit if (p := pupils[k]) is not None], weights[:, lit]
     if not some:
         dark = np.zeros(len(weights))
         return Spread(np.zeros((len(weights), side, side)), centre, dark, dark, False, math.nan)
-    aside = [math.dist(p.centre_mm, centre) for p in some]
-    corner_px = min(_resolved_mm(p) - a for p, a in zip(some, aside, strict=True)) * math.sqrt(2) / pixel_mm
-    unseen = max(math.ceil((side - corner_px) / 2), 0)  # pixels on each side of the window
-    by_rays = unseen > 0 and side - 2 * unseen < 2 * reach_of(some) / pixel_mm
-    reach = (side - 2 * unseen) * pixel_mm / math.sqrt(2)
-    needed = [cells_needed(p, reach + a) for p, a in zip(some, aside, strict=True)]
-    rays = 32 * math.ceil(max(p.blur_mm for p in some) / pixel_mm / 4)  # across the pupil, to be counted by pixels
-    if by_rays:
-        needed = [min(max(_FEWEST, rays), _MOST_CELLS)] * len(some)
+    blur = max(p.blur_mm for p in some)
+    rays = min(max(_FEWEST_RAYS, 8 * math.ceil(_RAYS_PER_PIXEL * 2 * blur / pixel_mm / 8)), _MOST_CELLS)
+    by_rays = max(needed[lit[0]]) > FINEST
     line = (np.arange(side) - (side - 1) / 2) * pixel_mm
     parts, done = list[tuple[Array, ...]](), 0
     while done < len(some):
-        group = some[done : done + max(1, _AT_ONCE // max(needed[done:]) ** 2)]
-        cells = max(needed[done : done + len(group)])
+        across, down = (rays, rays) if by_rays else np.max([needed[k] for k in lit[done:]], 0).tolist()
+        group = some[done : done + max(1, _AT_ONCE // (across * down))]
         done += len(group)
         x, y = np.array([centre - p.centre_mm for p in group]).T[..., None] + line
-        (share, weight), (cycles, light) = open_shares(group, cells), waves_of(group, cells)
-        area = np.prod([2 * p.half / cells for p in group], 1)
-        fold = max(k for k in (1, 2, 4) if k == 1 or cells // k >= max(rays, _FEWEST // 2))
-        counted = spent = _by_rays(group, x, y, pixel_mm, light * share, fold) * area[:, None, None]
+        (share, weight), (cycles, light) = open_shares(group, (across, down)), waves_of(group, (across, down))
+        area = np.prod([2 * p.half for p in group], 1) / (across * down)
+        counted = spent = _by_rays(group, x, y, pixel_mm, light * share, rays) * area[:, None, None]
         if not by_rays:
-            seen = slice(unseen, side - unseen)
-            spent = by_pixel(group, x[:, seen], y[:, seen], pixel_mm, phasor(cycles, np.sqrt(light) * weight))
-            spent = np.pad(spent, [(0, 0), (unseen, unseen), (unseen, unseen)])
+            spent = by_pixel(group, x, y, pixel_mm, phasor(cycles, np.sqrt(light) * weight))
         parts.append((counted, spent, *((s.sum((1, 2), dtype=np.float64) * area) for s in (light * share, share))))
     *images, total, solid = (np.concatenate(part) for part in zip(*parts, strict=True))
     energy = weights @ total
@@ -220,11 +207,11 @@ def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, field: Field) -> Arra
 
 
 def irradiances(pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, fields: Field) -> NDArray[np.float32]:
-    """Return what `irradiance` does, [W, Y, X], for pupils with places [W, X], [W, Y] and fields [W, cells, cells]."""
+    """Return what `irradiance` does, [W, Y, X], for pupils with places [W, X], [W, Y] and fields [W, *cells]."""
     wave, half = np.array([p.wavelength_nm * 1e-6 for p in pupils]), np.array([p.half for p in pupils])
     x, y = (size[:, None] * place for size, place in zip((half / wave[:, None]).T, (x_mm, y_mm), strict=True))
     found = _transformed(_transformed(fields, x).swapaxes(1, 2), y)
-    scale = ((2 * half / fields.shape[1]).prod(1) / wave) ** 2
+    scale = ((2 * half).prod(1) / math.prod(fields.shape[1:]) / wave) ** 2
     return np.asarray((found.real**2 + found.imag**2) * scale.astype(np.float32)[:, None, None])
 
 
@@ -245,24 +232,24 @@ def _transformed(fields: Field, cycles: Array) -> Field:
     return np.concatenate([(even - odd)[:, ::-1][:, : places // 2], even + odd], 1)
 
 
-def waves_of(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the wavefronts in waves and the light per area of cosines (mm^2) in cells, [W, cells, cells]."""
+def waves_of(pupils: Sequence[ExitPupil], cells: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the wavefronts in waves and the light per area of cosines (mm^2) in cells, [W, *cells]."""
     figures = np.array([p.figures[..., :2] for p in pupils]).transpose(3, 0, 1, 2)
     figures[0] *= np.array([1e6 / p.wavelength_nm for p in pupils])[:, None, None]
     # Sums of waves have at most some 100 waves, of which float32 leaves 1e-5.
-    cycles, light = summed(figures.astype(np.float32), (middles(cells),) * 2)
+    cycles, light = summed(figures.astype(np.float32), tuple(map(middles, cells)))
     return cycles, np.maximum(light, 0)
 
 
-def cells_of(pupil: ExitPupil, cells: int) -> Field:
-    """Return the field [cells, cells] of the pupil's cells, each times its weight (`open_shares`)."""
-    return open_shares([pupil], cells)[1][0] * pupil.field((middles(cells),) * 2)
+def cells_of(pupil: ExitPupil, cells: tuple[int, ...]) -> Field:
+    """Return the field [*cells] of the pupil's cells, each times its weight (`open_shares`)."""
+    return open_shares([pupil], cells)[1][0] * pupil.field(tuple(map(middles, cells)))
 
 
 def perfect_peak(pupil: ExitPupil, field: Field) -> float:
     """Return the irradiance in the middle of the image that the same pupil has without aberrations."""
     even, middle = pupil.perfect(), np.zeros(1)
-    return float(irradiance(even, middle, middle, cells_of(even, len(field)))[0, 0])
+    return float(irradiance(even, middle, middle, cells_of(even, field.shape))[0, 0])
 
 
 def middles(cells: int) -> Array:
@@ -292,16 +279,28 @@ def _means(count: int, parts: int) -> NDArray[np.float32]:
 
 
 def _by_rays(
-    pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, pixel_mm: float, light: Array, fold: int
+    pupils: Sequence[ExitPupil], x_mm: Array, y_mm: Array, pixel_mm: float, light: Array, rays: int
 ) -> Array:  # fmt: skip
-    """Return the light [W, Y, X] of rays by pixel, one for `fold` by `fold` cells, whose light is [W, cells, cells]."""
-    count, rows, columns, cells = len(pupils), y_mm.shape[1], x_mm.shape[1], light.shape[1] // fold
-    both = np.repeat(np.eye(cells, dtype=np.float32), fold, 1)
-    light = both @ light @ both.T
-    hits = summed(slopes(pupils).astype(np.float32), (middles(cells),) * 2)
-    places = (hits - np.array([x_mm[:, 0], y_mm[:, 0]], np.float32).T[..., None, None]) / pixel_mm + 0.5
+    """Return the light [W, Y, X] that rays bring to pixels, from that of cells [W, *cells], which are joined to `rays`.
+
+    What meets the film from a cell fills a rectangle, of which each pixel has its share.
+    """
+    count, columns, rows = len(pupils), x_mm.shape[1], y_mm.shape[1]
+    joined = [max(k for k in (1, 2, 4) if k == 1 or n // k >= rays) for n in light.shape[1:]]
+    for axis, k in enumerate(joined, 1):
+        light = np.add.reduce([light.take(range(n, light.shape[axis], k), axis) for n in range(k)])
+    ends = summed(slopes(pupils).astype(np.float32), tuple(np.linspace(-1, 1, n + 1) for n in light.shape[1:]))
+    ends = (ends - np.array([x_mm[:, 0], y_mm[:, 0]], np.float32).T[..., None, None]) / pixel_mm + 0.5
     # Integers hold no place that is kilometres aside, where the series of a pupil may end beyond its edges.
-    column, row = np.floor(places).clip(-1, max(rows, columns)).astype(np.int32).swapaxes(0, 1)
-    met = (column >= 0) & (column < columns) & (row >= 0) & (row < rows) & (light > 0)
-    place = (np.arange(count)[:, None, None] * rows + row) * columns + column
-    return np.asarray(np.bincount(place[met], light[met], count * rows * columns).reshape(count, rows, columns))
+    ends = ends.clip(-1, np.array([columns, rows], np.float32)[:, None, None] + 0.5)
+    one, other = (f(ends[:, :, :-1], ends[:, :, 1:]) for f in (np.minimum, np.maximum))
+    low, high = np.minimum(one[..., :-1], one[..., 1:]), np.maximum(other[..., :-1], other[..., 1:])
+    first = np.floor(low)
+    # The share of the next pixel: cells are less than a pixel wide.
+    after = ((high - first - 1) / np.maximum(high - low, 1e-6)).clip(0, 1)
+    column, row = first.astype(np.intp).swapaxes(0, 1) + 1
+    place = ((np.arange(count)[:, None, None] * (rows + 3) + row) * (columns + 3) + column).reshape(-1)
+    found, (x, y) = np.zeros(count * (rows + 3) * (columns + 3)), after.swapaxes(0, 1)
+    for step, share in ((0, (1 - x) * (1 - y)), (1, x * (1 - y)), (columns + 3, (1 - x) * y), (columns + 4, x * y)):
+        found += np.bincount(place + step, (light * share).reshape(-1), len(found))
+    return found.reshape(count, rows + 3, columns + 3)[:, 1 : rows + 1, 1 : columns + 1]

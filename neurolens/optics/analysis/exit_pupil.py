@@ -33,14 +33,20 @@ _FEWEST = 240  # the fewest rays for their 120 terms
 _BEYOND = 1.15  # rays up to so many radii of a rim count for the polynomials
 # Slopes of Chebyshev series from the series.
 _STEEP = np.pad(chebyshev.chebder(np.eye(_DEGREE + 1)), [(0, 1), (0, 0)])
-# Cells that an edge crosses have so many parts along a side. By parts: shares of the four corners of the cell, and what
-# three middles about it, and nine, weigh in a sum.
-_PARTS = 6
-_PART = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5).astype(np.float32)
-_WAYS = np.stack([np.outer(a, b).reshape(-1) for b in (0.5 - _PART, 0.5 + _PART) for a in (0.5 - _PART, 0.5 + _PART)])
-_NEAR = np.stack([_PART * (_PART - 1) / 2, 1 - _PART**2, _PART * (_PART + 1) / 2])
-_MOMENTS = np.einsum("ap,bq->pqab", _NEAR, _NEAR).reshape(-1, 9) / _PARTS**2
+# Lines at Gauss's nodes run through a cell that an edge crosses, from its side with most light to the other one. By
+# powers of the lit part of each: what the nine middles about the cell weigh in sums over it, exact for parabolas.
+_NODES, _SHARES = (a / 2 for a in np.polynomial.legendre.leggauss(3))
+_GROWN = np.array([[3 / 8, -1 / 2, 1 / 6], [3 / 4, 1 / 2, -1 / 3], [-1 / 8, 0, 1 / 6]])
+_NEAR = np.stack([_NODES * (_NODES - 1) / 2, 1 - _NODES**2, _NODES * (_NODES + 1) / 2]) * _SHARES
+_MOMENTS = np.einsum("pn,qk->nkpq", _GROWN, _NEAR).reshape(-1, 9).astype(np.float32)
+# The four corners as seen from each side of a cell, and which of them are on it.
+_CORNERS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [0, 2, 1, 3], [2, 0, 3, 1]])
+_ON = np.array([[k in side[::2] for side in _CORNERS] for k in range(4)], np.float32)
+# Begins of lines, and ways along them.
+_LINES = [np.kron([0.5 - _NODES, 0.5 + _NODES], way).astype(np.float32) for way in ([[1], [0]], [[-1], [1]])]
+_HALVINGS = 6  # of a line, to find where a blade or a mask ends its lit part
 _ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
+_TINY = 1e-12  # in place of zero, to divide by
 _FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
 
 
@@ -55,7 +61,7 @@ class ExitPupil:
         figures: [D, D, K] Chebyshev coefficients on that box: of the wavefront W in mm, of the light per area of
             cosines in mm^2 (for an irradiance of 1 at the lens), and of x, y in mm at each surface that may cut the
             beam.
-        limits_mm: radii of those surfaces; the stop is the first. Traced pupils have `_told` as the last.
+        limits_mm: radii of those surfaces; the stop is the first.
         aperture: the stop's shape.
         hits_mm: [2, N] where some of the rays meet the film, counted from the centre.
         box: the part of the disc across the light's direction that holds the rays, [2 (low, high), 2].
@@ -76,18 +82,22 @@ class ExitPupil:
         """Return the greatest distance of a ray from the centre on the film."""
         return float(np.hypot(*self.hits_mm).max())
 
-    def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
+    @cached_property
+    def blurs_mm(self) -> Array:
+        """Return the greatest distance [2] of a ray from the centre along x and y on the film."""
+        return np.asarray(np.abs(self.hits_mm).max(1))
+
+    def passes(self, places: Array | tuple[Array, ...]) -> NDArray[np.bool_]:
         """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
         at = self._at(places, slice(2, None))
-        return _lets(
-            self.aperture, np.array(self.limits_mm)[:, None], at.reshape(len(self.limits_mm), 2, 1, *at.shape[1:])
-        )[0]
+        at = at.reshape(-1, 2, *at.shape[1:])
+        return _lets(self.aperture, (at.T / self.limits_mm).T)[0]
 
     def open_share(self, cells: int) -> Array:
         """Return the share [cells, cells] of each cell of the box that light passes, as `open_shares`."""
-        return np.asarray(open_shares([self], cells)[0][0], np.float64)
+        return np.asarray(open_shares([self], (cells, cells))[0][0], np.float64)
 
-    def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex64]:
+    def field(self, places: Array | tuple[Array, ...]) -> NDArray[np.complex64]:
         """Return sqrt(e) exp(i k W) at points, which are as in `passes`."""
         w, e = self._at(places, slice(2))
         return phasor(w * (1e6 / self.wavelength_nm), np.sqrt(np.maximum(e, 0)))
@@ -98,16 +108,16 @@ class ExitPupil:
         figures[..., 0] = 0
         return replace(self, figures=figures, centre_mm=np.zeros(2), hits_mm=np.zeros((2, 1)))
 
-    def hits(self, places: Array | tuple[Array, Array]) -> Array:
+    def hits(self, places: Array | tuple[Array, ...]) -> Array:
         """Return where the rays of points, which are as in `passes`, meet the film: [2, ...] in mm from the centre."""
         return summed(slopes([self])[0], places)
 
-    def _at(self, places: Array | tuple[Array, Array], rows: slice) -> Array:
+    def _at(self, places: Array | tuple[Array, ...], rows: slice) -> Array:
         """Return the figures [K, ...] at points, which are as in `passes`."""
         return summed(np.moveaxis(self.figures[..., rows], -1, 0), places)
 
 
-def summed(figures: Array, places: Array | tuple[Array, Array]) -> Array:
+def summed(figures: Array, places: Array | tuple[Array, ...]) -> Array:
     """Return Chebyshev series [..., D, D] at points, as in `ExitPupil.passes`, in the precision of the figures."""
     if isinstance(places, tuple):
         u, v = (_on_line(p.tobytes()).astype(figures.dtype) for p in places)
@@ -122,53 +132,72 @@ def slopes(pupils: Sequence[ExitPupil]) -> Array:
     return -np.stack([_STEEP @ wave, wave @ _STEEP.T], 1) / np.array([p.half for p in pupils])[..., None, None]
 
 
-def open_shares(pupils: Sequence[ExitPupil], cells: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the share [W, cells, cells] of each cell of the box that light passes, by the pupils of a place.
+def open_shares(pupils: Sequence[ExitPupil], cells: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the share [W, *cells] of each cell of the box that light passes, by the pupils of a place.
 
-    Besides, what the middles of the cells weigh in sums over the open pupil, [W, cells, cells]: each part of a cell
-    counts for the nine middles about it, so that parabolas are summed exactly. With shares, the edges would leave an
-    error four times as large on 160 cells across as these do on 80. Cells on an edge are divided; places at the rims
-    are linear between their corners.
+    Besides, what the middles of the cells weigh in sums over the open pupil, [W, *cells]: each part of a cell counts
+    for the nine middles about it, so that parabolas are summed exactly. Edges are found on lines through their cells,
+    along which places at the rims are linear.
     """
     aperture, rims = pupils[0].aperture, max(len(p.limits_mm) for p in pupils)
     # The stop, which comes first, stands again for rims that only other wavelengths have.
     lack = [rims - len(p.limits_mm) for p in pupils]
-    limits = np.array([p.limits_mm + p.limits_mm[:1] * k for p, k in zip(pupils, lack, strict=True)]).T
+    limits = np.array([p.limits_mm + p.limits_mm[:1] * k for p, k in zip(pupils, lack, strict=True)])
     kept = [[*range(2, 2 + 2 * (rims - k)), *[2, 3] * k] for k in lack]
     series = np.array([p.figures.take(k, -1) for p, k in zip(pupils, kept, strict=True)], np.float32)
-    at = summed(series.transpose(3, 0, 1, 2), (np.linspace(-1, 1, cells + 1),) * 2)
-    at = at.reshape(rims, 2, *at.shape[1:])
-    count = _lets(aperture, limits, at).view(np.int8)
-    count = count[:, :-1] + count[:, 1:]
-    count = count[:, :, :-1] + count[:, :, 1:]
-    edge = np.flatnonzero((count & 3) != 0)  # some of the four corners are lit, not all
-    w, i, j = np.unravel_index(edge, count.shape)
-    corner = (w * (cells + 1) + i) * (cells + 1) + j
-    ends = at.reshape(*at.shape[:2], -1).take(np.add.outer(corner, [0, cells + 1, 1, cells + 2]), 2)
-    cuts = ((ends * ends).sum(1).max((1, 2), initial=0) > (limits * limits).min(1)) | (np.arange(len(limits)) == 0)
-    inside = _lets(aperture, limits[cuts][:, w], ends[cuts] @ _WAYS).astype(np.float32)
-    whole = (count == 4).astype(np.float32)
-    shape, aside = (len(pupils), cells + 2, cells + 2), np.outer(np.arange(3) * (cells + 2), [1, 1, 1]) + np.arange(3)
-    place = np.ravel_multi_index((w, i, j), shape)[:, None] + aside.reshape(-1)
-    given = np.bincount(place.reshape(-1), (inside @ _MOMENTS).reshape(-1), math.prod(shape)).reshape(shape)
-    weight = _nearby(cells) @ whole @ _nearby(cells) + given[:, 1:-1, 1:-1].astype(np.float32)
-    whole.reshape(-1)[edge] = inside @ np.full(_PARTS**2, 1 / _PARTS**2, np.float32)
+    at = summed(series.transpose(3, 0, 1, 2), tuple(np.linspace(-1, 1, n + 1) for n in cells))
+    at = at.reshape(rims, 2, *at.shape[1:]) / limits.T.astype(np.float32)[:, None, :, None, None]
+    lit, height = _lets(aperture, at)
+    bits = lit.view(np.int8)
+    bits = bits[:, :-1] + 2 * bits[:, 1:]
+    bits = bits[:, :, :-1] + 4 * bits[:, :, 1:]
+    whole = (bits == 15).astype(np.float32)
+    edge = np.flatnonzero((bits > 0) & (bits < 15))  # some of the four corners are lit, not all
+    (w, i, j), wide = np.unravel_index(edge, bits.shape), cells[1] + 2
+    first, steps = (w * (cells[0] + 1) + i) * (wide - 1) + j, np.array([0, wide - 1, 1, wide])
+    # From the lit side; of two that are lit alike, from that where light passes farther from the rims.
+    light = (lit - 0.1 * height).reshape(-1)[first[:, None] + steps]
+    side = (light @ _ON).argmax(1)
+    corner = first[:, None] + steps[_CORNERS][side]
+    ends = at.reshape(rims, 2, -1).take(corner, 2)
+    cuts = ((ends * ends).sum(1).max((1, 2), initial=0) > 1) | (np.arange(rims) == 0)
+    begin, way = (ends[cuts] @ line for line in _LINES)
+    a, b, c = (way * way).sum(1), (way * begin).sum(1), 1 - (begin * begin).sum(1)
+    part = (c / np.maximum(b + np.sqrt(np.maximum(b * b + a * c, 0)), _TINY)).min(0).clip(0, 1)
+    if aperture is not None:
+        known = 0 * part
+        for _ in range(_HALVINGS):
+            part = part / 2
+            x, y = begin[0] + (known + part) * way[0]
+            known += part * aperture.inside(x, y, 1.0)
+        part = known + part / 2
+    given = np.concatenate([part, part * part, part * part * part], 1) @ _MOMENTS
+    about = np.add.outer(np.arange(3) * wide, np.arange(3))
+    about = np.stack([about, about[::-1], about.T, about.T[::-1]]).reshape(4, 9)
+    place = ((w * (cells[0] + 2) + i) * wide + j)[:, None] + about[side]
+    shape = len(pupils), cells[0] + 2, wide
+    weight = np.bincount(place.reshape(-1), given.reshape(-1), math.prod(shape)).reshape(shape)[:, 1:-1, 1:-1]
+    weight = _nearby(cells[0]) @ whole @ _nearby(cells[1]) + weight.astype(np.float32)
+    whole.reshape(-1)[edge] = given @ np.ones(9, np.float32)
     return whole, weight
 
 
 @lru_cache(maxsize=64)
 def _nearby(cells: int) -> Array:
     """Return the matrix [cells, cells] that gives the middles on a line what whole cells weigh."""
-    return np.asarray(sum(np.eye(cells, k=k) * m for k, m in zip((-1, 0, 1), _NEAR.mean(1), strict=True)), np.float32)
+    return np.asarray(sum(np.eye(cells, k=k) * m for k, m in zip((-1, 0, 1), _GROWN.sum(1), strict=True)), np.float32)
 
 
-def _lets(aperture: Aperture | None, limits_mm: Array, at: Array) -> NDArray[np.bool_]:
-    """Return whether light passes [W, ...], from rims' radii [K, W] and its places at them [K, 2, W, ...]."""
-    apart = limits_mm.astype(at.dtype).reshape(*limits_mm.shape, *[1] * (at.ndim - 3)) ** 2
-    inside = np.asarray((at[:, 0] ** 2 + at[:, 1] ** 2 <= apart).all(0))
+def _lets(aperture: Aperture | None, at: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Return whether light passes, from its places at rims [K, 2, ...] in units of their radii; how near a rim it is.
+
+    The second is the square of the height at the rim that it is nearest to, in these units.
+    """
+    height = (at * at).sum(1).max(0)
+    lit = np.asarray(height <= 1)
     if aperture is not None:
-        inside[inside] = aperture.inside(at[0, 0][inside], at[0, 1][inside], float(limits_mm[0, 0]))
-    return inside
+        lit[lit] = aperture.inside(at[0, 0][lit], at[0, 1][lit], 1.0)
+    return lit, height
 
 
 def phasor(cycles: Array, amplitude: Array | float = 1.0) -> NDArray[np.complex64]:
@@ -245,32 +274,14 @@ def fitted_pupil(
     centre = rays.hits[:, through].mean(1)
     every = range(len(limits))
     cut = [rays.stop, *(k for k in every if k != rays.stop and part[k, near].max() > 1)]
-    known = np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None])
-    design = _design(known.tobytes())
+    design = _design(np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None]).tobytes())
     along = np.concatenate([by / side for by, side in zip(design.slopes, half, strict=True)])
     wave = _least(along[:, 1:])(-(rays.hits[:, near] - centre[:, None]).reshape(-1))
     at, power = rays.at[cut][..., near].reshape(2 * len(cut), -1), (rays.power * energy)[near]
     figures = _fitted(design, half, np.array([0 * power, power, *places[:, near], *at])[:, None])[0]
     figures[_I, _J, 0] = [0, *wave]
-    figures = np.concatenate([figures, _told(known)], -1)
     hits, box = rays.hits[:, through] - centre[:, None], np.zeros((2, 2)) if box is None else box
-    return ExitPupil(wavelength_nm, centre, middle, half, figures, (*limits[cut], 1.0), aperture, hits, box)
-
-
-def _told(points: Array) -> Array:
-    """Return the series [D, D, 2] of x and y that keep within 1 in an ellipse about points [2, N] of the box.
-
-    It is a rim of the pupil: beyond the rays that they were fitted to polynomials swing, and may let light pass.
-    """
-    share, found = np.full(points.shape[1], 1 / points.shape[1]), np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
-    for _ in range(20):  # Titterington's way to the smallest ellipse: points far out come to weigh more
-        middle = points @ share[:, None]
-        round_ = np.linalg.inv(np.linalg.cholesky((points - middle) * share @ (points - middle).T))
-        apart = ((round_ @ (points - middle)) ** 2).sum(0)
-        share = share * (apart + 1) / 3
-    round_ /= math.sqrt(apart.max())
-    found[[0, 1, 0], [0, 0, 1]] = np.column_stack([-round_ @ middle, round_]).T
-    return found
+    return ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), aperture, hits, box)
 
 
 def fitted_waves(

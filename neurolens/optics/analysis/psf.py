@@ -89,11 +89,11 @@ def _images(filled: Filled, waves: Sequence[ExitPupil | None], level: int, least
         half = max(least_mm, 1.1 * radius)
         if not (half > 0 and w.sum() > 0):
             half = math.nan
-        cells, image = 0, np.full((_POINTS, _POINTS), np.nan)
+        cells, image = (0, 0), np.full((_POINTS, _POINTS), np.nan)
         if pupil is not None and not math.isnan(half):
             cells = cells_needed(pupil, math.sqrt(2) * half)
-        if pupil is not None and 0 < cells <= FINEST:
-            line, field = np.linspace(-half, half, _POINTS), cells_of(pupil, cells << (level - 1))
+        if pupil is not None and 0 < max(cells) <= FINEST:
+            line, field = np.linspace(-half, half, _POINTS), cells_of(pupil, tuple(n << (level - 1) for n in cells))
             chief = np.array([float(c[k]) for c in filled.chief.film[:2]]) - pupil.centre_mm
             # Tangential is along -x or -y of the film, sagittal along the other axis.
             if filled.scene.axis == "x":
@@ -101,7 +101,7 @@ def _images(filled: Filled, waves: Sequence[ExitPupil | None], level: int, least
             else:
                 image = irradiance(pupil, chief[0] + centre[1] + line, chief[1] - centre[0] - line, field)
             image = image / perfect_peak(pupil, field)
-        rows.append((1000 * half, centre, image, float(cells)))
+        rows.append((1000 * half, centre, image, float(max(cells))))
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
