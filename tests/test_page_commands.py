@@ -108,8 +108,11 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
                     made |= {Path(asked.output)} if getattr(asked, "output", None) else set()
 
 
-# The README's lines run, some in a smaller size: what is printed, and what stands for it or follows it here.
+# The README's lines run, some in a smaller size, by a model or a simpler lens: what is printed, and what stands for it.
 SMALLER = {
+    "handover laikin_double_gauss_50": "handover laikin_double_gauss_50.ols-36",
+    "flare canon_50mm_f1_2": "flare cooke_triplet_50",
+    "projection laikin_double_gauss_50": "projection laikin_double_gauss_50.ols-36",
     "--width 3840": "--width 96",
     "--width 480 --samples 64": "--width 24 --samples 1",
     "--width 480 --film": "--width 24 --film",
