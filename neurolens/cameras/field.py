@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.ideal import PROJECTIONS
+from neurolens.cameras.sampling import axis_mm
 from neurolens.optics.lens import paraxial
 
 Array = NDArray[np.float64]
@@ -112,7 +113,7 @@ def frame_of(camera: Any) -> Frame:
 def _measured(camera: Any) -> Frame:
     """Find the ideal camera beside one without first-order data: rays close to the axis are traced to two planes."""
     height = _SMALL * math.hypot(*camera.film_mm) / 2
-    points = np.asarray(height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j]), np.complex128)
+    points = np.asarray(on_axis(camera) + height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j]), np.complex128)
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
     sizes = []
     for distance in (near, far):  # by the middle of the pupil
@@ -123,6 +124,11 @@ def _measured(camera: Any) -> Frame:
     growth = [(b - a) / (far - near) for a, b in zip(*sizes, strict=True)]  # per mm: 1 / reach
     pupil = [near - a / g for a, g in zip(sizes[0], growth, strict=True)]
     return Frame((float(1 / growth[0]), float(1 / growth[1])), (float(pupil[0]), float(pupil[1])))
+
+
+def on_axis(camera: Any) -> Complex:
+    """Return the picture point [1] on the axis."""
+    return np.array([-complex(*axis_mm(camera)[0])])
 
 
 def traced_light(
@@ -382,14 +388,14 @@ def field_of(
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
     # At the very rim few samples of the pupil are lit, so that their mean steps to and fro: that is no fold.
-    place = np.where(found.light < DIM * found.light[0], np.nan, place)
+    whole = float(at(on_axis(camera))[1].light[0])
+    place = np.where(found.light < DIM * whole, np.nan, place)
     place = _filled(place.reshape(rings, azimuths))
     rising = (np.diff(np.abs(place - place[:1]), axis=0) > 0).all(1)
     if not rising.all():
         fold = end * (int(np.argmin(rising)) + 1) / (rings - 1)
         raise InputError(camera.name, "film_mm", camera.film_mm, f"no picture beyond {fold:.4g} mm, where it folds")
-    ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
-    light = light / light[0].mean()
+    ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths) / whole
     return Field(ideal, _inverted(ideal), frame, target, end, widest, light, distance, spectrum)
 
 

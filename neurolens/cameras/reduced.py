@@ -18,7 +18,7 @@ so that blur keeps its shape:
     both: 1     natural: N / V     optical: O / V     none: 1 / V
 
 White surroundings then show V, N, O, or 1 wherever any light arrives. The means, over the wavelengths too, are tabled
-on rings of the film, which are closer to each other towards the end of the light.
+on rings about the axis, which are closer to each other towards the end of the light.
 """
 
 import math
@@ -43,12 +43,13 @@ from neurolens.cameras.field import (
     field_of,
     film_edge,
     frame_of,
+    on_axis,
     on_rings,
     spectrum_of,
     traced_light,
     turns,
 )
-from neurolens.cameras.sampling import common_light, is_light, stratified
+from neurolens.cameras.sampling import axis_mm, common_light, is_light, stratified
 from neurolens.optics.lens.prescription import LINE_D_NM
 from neurolens.optics.lens.shot import Dispersion, Vignetting
 
@@ -139,6 +140,7 @@ class ReducedDispersion:
         self._nm = min(max(LINE_D_NM, light[0]), light[1])
         self.lateral = self.dispersive = dispersion == "lateral" and camera.dispersive and light[0] < light[1]
         self.settings: dict[str, Any] = {**camera.settings, "dispersion": dispersion}
+        self._axis, self._reach = (part[:, None].astype(np.float32) for part in axis_mm(camera))
         self._lit_nm = np.linspace(*light, _TINTS)
         lit = np.array([self._exposure(nm) for nm in (self._nm, *self._lit_nm)])
         self._tint = lit[1:] / lit[0] if lit[0] > 0 else np.ones(_TINTS)
@@ -187,10 +189,10 @@ class ReducedDispersion:
         return np.full(rays.shape[1], self._nm, np.float32)
 
     def _exposure(self, nm: float) -> float:
-        """Return the mean weight, at a wavelength, of the rays of the film's middle."""
+        """Return the mean weight, at a wavelength, of the rays of the film point on the axis."""
         square, _ = stratified(_SIDE_OF_AXIS, (nm, nm))
-        middle, light = np.zeros_like(square), np.full(square.shape[1], nm, np.float32)
-        return float(self.camera.sample(middle, square, light).weight.mean(dtype=np.float64))
+        film, light = np.zeros_like(square) + self._axis, np.full(square.shape[1], nm, np.float32)
+        return float(self.camera.sample(film, square, light).weight.mean(dtype=np.float64))
 
     def tints(self, wavelength_nm: FloatArray) -> FloatArray:
         """Return the light [N] on the axis at wavelengths [N] (nm), over that at the reference wavelength."""
@@ -212,8 +214,8 @@ class ReducedDispersion:
         shift = np.zeros((len(wavelength_nm), *film_mm.shape), np.float32)
         if not self.lateral:
             return shift
-        bound = np.array(self.film_mm, np.float32)[:, None]
-        at = np.clip(film_mm / bound, -1, 1)  # beyond the film the polynomials mean nothing
+        # From the axis, about which a lens is symmetric; beyond the film the polynomials mean nothing.
+        at = np.clip((film_mm - self._axis) / (2 * self._reach), -1, 1)
         parts = (self._terms @ _monomials(at)).reshape(2, _ORDERS, -1) * at[:, None]
         wave = self._wave(wavelength_nm)[:, None]
         for order in range(_ORDERS)[::-1]:
@@ -238,7 +240,7 @@ class ReducedDispersion:
         lit = np.isfinite(found).all(axis=(0, 1))
         if not lit.any():
             raise InputError(self.name, "dispersion", "lateral", "a camera that light can pass")
-        shift, at = found[..., lit], (film / np.array(self.film_mm)[:, None])[:, lit]
+        shift, at = found[..., lit], ((film - self._axis) / (2 * self._reach))[:, lit]
         train = np.arange(at.shape[1]) % 2 == 0
         powers = self._wave(waves)[:, None] ** np.arange(1, _ORDERS + 1)
         products = np.einsum("wo,mn->womn", powers, _monomials(at))
@@ -294,14 +296,19 @@ class Vignetted:
         self.rays_a_call = getattr(camera, "rays_a_call", RAYS_A_CALL)
         self.settings: dict[str, Any] = {**camera.settings, "vignetting": vignetting}
         light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
-        corner = 1.0001 * math.hypot(*camera.film_mm) / 2
-        self._end = end_of_light(lambda r: bool((_means(camera, light, r * _AROUND, 16)[0] > 0).any()), corner)
-        tried = _means(camera, light, (self._end * np.array(_TRIED)[:, None] * _AROUND).reshape(-1), _OTHER[2])[0]
+        axis, reach = axis_mm(camera)
+        self._axis, corner = complex(*axis), 1.0001 * math.hypot(*reach)
+
+        def means(from_axis: Complex, side: int) -> tuple[Array, Array]:
+            return _means(camera, light, self._axis + from_axis.reshape(-1), side)
+
+        self._end = end_of_light(lambda r: bool((means(r * _AROUND, 16)[0] > 0).any()), corner)
+        tried = means(self._end * np.array(_TRIED)[:, None] * _AROUND, _OTHER[2])[0]
         uneven = np.ptp(tried.reshape(len(_TRIED), -1), axis=1) > _UNEVEN * tried.max()
         rings, azimuths, side = _OTHER if uneven.any() else _ROUND
         radius = self._end * (1 - (1 - np.arange(rings) / (rings - 1)) ** 2)
-        means = _means(camera, light, (radius[:, None] * turns(azimuths)).reshape(-1), side)
-        value, optical = (m.reshape(rings, azimuths) for m in means)
+        found = means(radius[:, None] * turns(azimuths), side)
+        value, optical = (m.reshape(rings, azimuths) for m in found)
         optical /= optical[0].mean()
         natural = np.where(optical > 0, value / np.where(optical > 0, optical, 1) / value[0].mean(), np.nan)
         for row in range(1, rings):  # where it is dark, the value is that where light was last
@@ -341,9 +348,10 @@ class Vignetted:
     def _factors(self, passed: NDArray[np.bool_], film_mm: FloatArray) -> Array:
         """Return the factors of the weights of rays; 0 where none passes or the table is dark."""
         x, y = np.nan_to_num(film_mm.astype(np.float64), posinf=1e9, neginf=-1e9)
-        radius = np.hypot(x, y)
+        off = x + 1j * y - self._axis
+        radius = np.abs(off)
         place = 1 - np.sqrt(1 - np.minimum(radius / self._end, 1))  # rings are equal steps of it
-        point = (x + 1j * y) / np.where(radius > 0, radius, 1) * place
+        point = off / np.where(radius > 0, radius, 1) * place
         value, wanted = (on_rings(table, 1.0, point) for table in (self._cards["both"], self._cards[self.vignetting]))
         lit = (value > 0) & passed
         return np.where(lit, np.maximum(wanted, 0) / np.where(lit, value, 1), 0)
@@ -387,7 +395,7 @@ class Warped:
         self._frames = {id(c): frame_of(c) for c in (flat, camera)}
         self._shown = camera
         self._fields: dict[int, Field] = {}
-        self._axis = {id(c): self._traced(c, np.zeros(1, complex))[1][0] for c in (flat, camera)}
+        self._axis = {id(c): self._traced(c, on_axis(c))[1][0] for c in (flat, camera)}
         near, own, frame = 1e-3 / focus_m, self._frames[id(flat)], self._frames[id(camera)]
         # Sizes of things in focus, of the one over the other: 1, except in the second meridian of a lens with
         # cylinders.

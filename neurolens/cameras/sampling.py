@@ -168,6 +168,13 @@ def focus_m(camera: Camera, shot: Shot) -> float:
     return math.inf if chosen is None else float(chosen)
 
 
+def axis_mm(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the film point [2] on a camera's axis, away from the middle of a film that is moved, and how far from the
+    axis the film reaches along x and along y [2]."""
+    axis = np.array([camera.settings.get(name) or 0.0 for name in ("film_shift_mm", "film_rise_mm")])
+    return axis, np.array(camera.film_mm) / 2 + np.abs(axis)
+
+
 def positive(field: str, value: float, *, infinite: bool = False) -> float:
     """Return `value` as a float above 0, finite unless `infinite` is allowed.
 

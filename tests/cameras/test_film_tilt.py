@@ -17,9 +17,12 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.field import field_of
 from neurolens.cameras.lensfilm import whole_camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pose import FilmPose
+from neurolens.cameras.reduced import ReducedDispersion, Vignetted
+from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.cli.keys import frames_of
 from neurolens.graph.compiler import has_compiler
@@ -105,6 +108,17 @@ def test_a_shifted_film_sees_what_a_larger_one_sees() -> None:
     # To the right and, for a negative rise, below: the middle of the picture looks there.
     middle = moved.sample(np.zeros((2, 1), np.float32), np.full((2, 1), 0.5, np.float32), nm[:1]).direction[:, 0]
     assert middle[0] > 0.05 and middle[1] < -0.05
+
+
+def test_what_is_stated_about_the_axis_is_about_that_of_a_moved_film(camera: ExactCamera) -> None:
+    """Light is 1 on the axis, in a part of the vignetting and in a field; lateral colour is odd about the axis."""
+    camera = camera.compiled() if has_compiler() else camera
+    film, square = np.repeat([[5.0], [-4.0]], 64**2, axis=1).astype(np.float32), stratified(64, (550, 550))[0]
+    found = Vignetted(camera, "natural", (550, 550)).sample(film, square, np.full(64**2, 550, np.float32))
+    assert found.weight.mean() == pytest.approx(1, abs=2e-3)
+    field = field_of(camera, 2.0, spectrum=(np.array([550.0]), np.ones(1)))
+    assert field.relative_light(np.array([-5 + 4j])) == pytest.approx(1, abs=1e-3)
+    assert ReducedDispersion(camera, "lateral").settings["lateral_error_mm"] < 1e-3
 
 
 @pytest.mark.parametrize("form", ["c", "model"])

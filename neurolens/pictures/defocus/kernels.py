@@ -27,6 +27,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import frame_of
+from neurolens.cameras.sampling import axis_mm
 from neurolens.pictures.defocus.diffraction import MOST_PX, Diffraction, lens_of, on_upright, spreads
 from neurolens.pictures.defocus.plate import (
     FloatArray,
@@ -379,7 +380,8 @@ def tint(camera: Camera) -> NDArray[np.float64]:
     side = (np.arange(_TINT_PUPIL) + 0.5) / _TINT_PUPIL
     square = np.tile(np.stack(np.meshgrid(side, side)).reshape(2, -1), _TINT).astype(np.float32)
     nm = light.centres_nm.repeat(_TINT_PUPIL**2).astype(np.float32)
-    passed = camera.sample(np.zeros_like(square), square, nm).weight.reshape(_TINT, -1).mean(axis=1, dtype=np.float64)
+    film = np.zeros_like(square) + axis_mm(camera)[0][:, None].astype(np.float32)
+    passed = camera.sample(film, square, nm).weight.reshape(_TINT, -1).mean(axis=1, dtype=np.float64)
     if not passed.all():
         return np.eye(3)
     alone = np.maximum(light.response * light.basis, 0)
