@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.lensname import is_model, split_kind
 from neurolens.base.report import OPTIONAL, Report
-from neurolens.base.settings import changed, group, setting
+from neurolens.base.settings import RANGE, changed, group, setting
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.lenscamera import LensCamera
 from neurolens.cameras.onnxlens import load_model
@@ -45,8 +45,8 @@ class Export(cli.Reporting):
 
     The code has the model's domain guard, stop, rims, transmittance and status codes. A comment at the top holds the
     card; beside it stand constants, and the place of the film for a focus. For a model of a whole zoom (or of internal
-    focus) the state is an argument. A lens file gives the exact lens; --to c-double keeps it within 1e-12 mm of the
-    tracer. OSL is a camera of Blender's Cycles (4.5 and later), whose inputs are stop, focus, blades, zoom and more.
+    focus) the state is an argument. A lens file gives the exact lens, in the zoom, size and coating asked for; --to
+    c-double keeps it within 1e-12 mm of the tracer. OSL is a camera of Blender's Cycles (4.5 and later), whose inputs are stop, focus, blades, zoom and more.
 
     With --whole-camera the code is the camera for one focus and stop: it takes a film point and two random numbers, and
     gives a weighted ray. The pupil's outline is a table in the file, or data beside it for most shading languages.
@@ -125,9 +125,17 @@ examples:
                 what = "a camera" if self.whole_camera else "a lens file"
                 self.refuse(str(file), f"({what})", "source code (--to c, glsl ...), without --fix, --only")
             write = self._write_camera if self.whole_camera else self._write_lens
+            size = {"--focal-length", "--field"} if self.state.given.zoom != RANGE else set()
+            self._check_state(size | {"--zoom", "--coating"}, "focus and stop are arguments of the function")
         else:
             write = partial(self._write_model, fixed=fixed)
+            self._check_state(set(), "--fix sets focus and stop, the rest is the model's own")
         return self.answer(write(file))
+
+    def _check_state(self, taken: Collection[str], said: str) -> None:
+        """Refuse options of a lens's state that code without a film does not follow."""
+        if not self.whole_camera and (left := sorted(changed(self.state, unset=True).keys() - taken)):
+            self.refuse(", ".join(left), "(without --whole-camera)", f"left out: {said}")
 
     def _exported(self, **figures: Any) -> Exported:
         return Exported(self.out, self.to, self.out.stat().st_size, **figures)
@@ -155,7 +163,7 @@ examples:
         from neurolens.cameras.shaders.lens_source import write_lens
 
         return self._source(
-            write_lens(file, self.out, self.to, name=self.name, zoom=self.state.given.zoom, progress=self.progress())
+            write_lens(file, self.out, self.to, self.state.shot(), name=self.name, progress=self.progress())
         )
 
     def _write_osl(self, file: Path) -> Exported:

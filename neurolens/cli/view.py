@@ -24,6 +24,7 @@ from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.layout import layout_profile
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers import lensfile
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_plane_z_mm
@@ -227,7 +228,8 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None)
 
 
 def _exact_form(zoom: str | None, file: Path, lens: Lens, kinds: Sequence[str], osl: str | None) -> Form:
-    written = [write_lens(file, file.with_suffix(f".{to}"), to, zoom=zoom) for to in ("glsl", "c") if to in kinds]
+    shot = Shot.part(zoom=zoom)
+    written = [write_lens(file, file.with_suffix(f".{to}"), to, shot) for to in ("glsl", "c") if to in kinds]
     data = first_order(lens)
     facts = {
         "name": lens.name, "source": lens.source, "efl_mm": float(data.efl_mm),

@@ -133,6 +133,10 @@ def test_the_exact_lens_as_a_function(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not re.search(r"\bfloat\b|\df\b|sqrtf|fmaf", (tmp_path / "d.h").read_text().split("*/", 1)[1])
     assert main(["export", str(LENS), "--to", "glsl", "-o", str(shader)]) == 0
     assert "const float LAIKIN_DOUBLE_GAUSS_50_PUPIL_Z_MM = (-17.27" in shader.read_text()
+    size = ["--focal-length", "85", "--coating", "bare"]
+    assert main(["export", str(LENS), "--to", "glsl", "-o", str(shader), *size]) == 0
+    assert "_EFL_MM = 85.0" in shader.read_text() and "coating bare" in shader.read_text()
+    assert main(["export", str(LENS), "--to", "glsl", "-o", str(shader), "--f-number", "4"]) == 2  # an argument
     text = header.read_text()
     domain = lens_models.domain()
     s = sample_domain(domain, 500, 0)
@@ -337,6 +341,7 @@ def test_states_of_a_zoom_are_chosen_when_a_camera_is_written(tmp_path: Path) ->
         (["--to", "onnx", "--camera"], "--to c, glsl ..."),
         (["--to", "c", "--camera", "--fix", "focus=2"], "without --fix"),
         (["--to", "c", "--derivatives"], "--to onnx"),
+        (["--to", "c", "--focus", "2", "--film-tilt", "3"], "--film-tilt, --focus: got (without --whole-camera)"),
         (["--to", "c", "--camera", "--zoom", "20"], "zoom"),
         (["--to", "c", "--camera", "--name", "int"], "name"),
     ],

@@ -1,7 +1,7 @@
 """Writes the exact lens of a file as source code, for one zoom position or with the zoom as an argument."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -21,6 +21,7 @@ from neurolens.models.fit import gap_axis, zoom_axis
 from neurolens.models.source import DOUBLE, Written, checked_name, lines_of, write_program
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.focusing import best_focus_of_stops_mm, focus_states
 from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
@@ -36,9 +37,9 @@ def write_lens(
     file: Path,
     out: Path,
     to: str,
+    shot: Shot,
     *,
     name: str | None = None,
-    zoom: str | float | None = None,
     progress: Progress | None = None,
 ) -> Written:
     """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and any zoom range.
@@ -47,24 +48,26 @@ def write_lens(
         file: the lens file.
         out: the file to write.
         to: one of `models.source.WRITERS`.
+        shot: zoom, size and coating of the lens; the zoom may be "range".
         name: of the function; None takes the lens's id.
-        zoom: a state as `set_lens` takes it, or "range".
     """
     lens = read_any(file)
     name = checked_name(to, lens.lens_id, name)
     axes: tuple[Axis, ...] = ()
     lines = []
-    if zoom == RANGE:
+    if shot.zoom == RANGE:
         axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: set_lens(lens, zoom=zoom_mm))
-        axes, nodes = (axis,), [set_lens(lens, zoom=v) for v in axis.nodes]
+        axes, nodes = (axis,), [set_lens(lens, replace(shot, zoom=v)) for v in axis.nodes]
         lines.append(
             f"Argument state: NAME_at(zoom_mm) makes it, once for all rays, of the focal length at infinity focus, "
             f"{_span(axis)} mm. Gaps between the source's own positions are within {1e3 * error_mm:.2g} um (measured)."
         )
     else:
-        nodes = [set_lens(lens, zoom=zoom)]
+        nodes = [set_lens(lens, shot)]
         if lens.configurations:
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
+    if given := {key: value for key, value in shot.given.items() if key != "zoom"}:
+        lines.append(f"The lens is set to {', '.join(f'{key} {value}' for key, value in given.items())}.")
     if focus_states(lens):
         lines.append(
             "Groups stand as at infinity focus: unlike in the product, the whole lens moves to focus (film_z_mm)."
@@ -73,7 +76,9 @@ def write_lens(
     program = lens_program(nodes, axes, planes, double=to == DOUBLE)
     constants, functions = followed(axes, numbers(nodes, planes))
     constants |= {**state_ranges(axes), "wavelength_min_nm": LIGHT_NM[0], "wavelength_max_nm": LIGHT_NM[1]}
-    placed, said = _film(lens, nodes, axes, progress or Progress(quiet=True))
+    between = [a.range[0] + (a.range[1] - a.range[0]) * share for a in axes for share in _CHECKED]
+    checked = {v: set_lens(lens, replace(shot, zoom=v)) for v in between}
+    placed, said = _film(nodes, axes, checked, progress or Progress(quiet=True))
     plane = f"z = {planes[0]:.6g} mm" if "pupil_z_mm" in constants else "z = NAME_pupil_z_mm(zoom_mm)"
     extras = Extras(constants, {**functions, **placed})
     return write_program(program, out, to, name, lines_of([*_head(lens, plane), *lines, *said]), extras)
@@ -97,11 +102,10 @@ def _head(lens: Lens, plane: str) -> list[str]:
 
 
 def _film(
-    lens: Lens, nodes: Sequence[Lens], axes: Sequence[Axis], progress: Progress
+    nodes: Sequence[Lens], axes: Sequence[Axis], between: Mapping[float, Lens], progress: Progress
 ) -> tuple[dict[str, Program], list[str]]:
-    """Return the film's position, as `film_extras` does."""
-    between = [a.range[0] + (a.range[1] - a.range[0]) * share for a in axes for share in _CHECKED]
-    lenses = [*nodes, *(set_lens(lens, zoom=v) for v in between)]
+    """Return the film's position, as `film_extras` does; `between` has the lens at states where it is measured."""
+    lenses = [*nodes, *between.values()]
     data = [first_order(at) for at in lenses]
     # In a zoom the separation of the principal planes may change its sign, so one number serves for all.
     apart = max(abs(float(d.rear_principal_z_mm - d.front_principal_z_mm)) for d in data)
