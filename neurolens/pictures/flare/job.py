@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.base.settings import LIGHT_NM
+from neurolens.cameras.exact import light_on_axis
 from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.rays import Rays, Traced, trace
@@ -21,6 +22,7 @@ from neurolens.pictures.render.colour import SpectralRange
 from neurolens.pictures.render.settings import FlareSettings
 
 _AXIS = 1 << 15  # rays that measure the exposure
+_WAVES = 16  # wavelengths over which it is a mean
 
 
 @dataclass(frozen=True)
@@ -53,10 +55,15 @@ class FlareJob:
         bins = self.settings.bins
         return SpectralRange(*self.wavelength_nm, bins=bins * max(finer, -(-least // bins)))
 
-    @property
+    @cached_property
     def exposure(self) -> float:
-        """The irradiance where the axis meets the film, at the mean wavelength: see `axis_irradiance`."""
-        return axis_irradiance(self.lens, 0.5 * sum(self.wavelength_nm)) * float(self.pose.axes[2, 2])
+        """The irradiance (sr) where the axis meets the film, in uniform surroundings of radiance 1, as a mean over the
+        wavelengths: that of a camera, so that flare and render have one unit."""
+        low, high = self.wavelength_nm
+        waves = low + (high - low) * np.append(0.5, (np.arange(_WAVES) + 0.5) / _WAVES)
+        one = axis_irradiance(self.lens, float(waves[0])) * float(self.pose.axes[2, 2])
+        middle, *light = light_on_axis(replace(self.lens, aperture=None), waves.tolist(), self.wavelength_nm)
+        return one * float(np.mean(light) / middle)
 
     @cached_property
     def tracer(self) -> GhostTracer:

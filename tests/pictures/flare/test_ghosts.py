@@ -11,10 +11,12 @@ from film_light import film_light
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras.exact import ExactCamera
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.figures import Biconic, Qcon, Toroid
 from neurolens.optics.lens.prescription import Lens, Surface
+from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import Rays, follow, trace, turning
@@ -157,16 +159,26 @@ def test_the_exposure_is_the_integral_of_the_pupil() -> None:
     )
 
 
+def test_flare_and_a_render_have_one_unit() -> None:
+    """Old coatings and glass pass little violet light: a camera's exposure is the mean over the wavelengths."""
+    lens = read_lens(LENSES / "takahashi_retrofocus_100.toml")
+    camera = ExactCamera(lens, Shot((12.0, 8.0), f_number=8.0, aperture=Aperture(5), runtime="onnxruntime"))
+    job = FlareJob(camera.lens, [], Raster((12.0, 8.0), 24, 16))
+    assert job.exposure == pytest.approx(camera.film.exposure, rel=2e-3)
+    assert job.exposure < 0.95 * axis_irradiance(camera.lens, 550.0)
+
+
 def test_a_picture_holds_the_light_that_falls_on_it() -> None:
     """A film that holds every ghost of a plate: the picture's sum is the rays' power, in every layer."""
     lens = plate()
     tracer, raster, light = GhostTracer(lens), Raster((60.0, 40.0), 120, 80), Light(5.0, 0.0, (2.0, 2.0, 2.0))
-    picture = ghost_picture(FlareJob(lens, [light], raster, FlareSettings(bins=3), ghosts=tracer, finer=1), [1])
+    job = FlareJob(lens, [light], raster, FlareSettings(bins=3), ghosts=tracer, finer=1)
+    picture = ghost_picture(job, [1])
     assert picture.shape == (2, 80, 120, 3) and not picture[0].any()
     rays, area = light_rays(lens, light, 0, 4096)
     flux = 2 * area * tracer.trace(rays, 550.0).power[0].mean()
     pixel = (60.0 / 120) ** 2
-    expected = flux / pixel / axis_irradiance(lens, 550.0)
+    expected = flux / pixel / job.exposure
     np.testing.assert_allclose(picture[1].sum((0, 1)), expected, rtol=2e-3)
     # The light stands to the right: so do its image and, in a plate, its ghost.
     places = picture[1].sum((0, 2)) @ (np.arange(120) + 0.5) / picture[1].sum()
