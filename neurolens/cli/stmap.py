@@ -22,7 +22,17 @@ from neurolens.base.report import PART, Report
 from neurolens.base.settings import LIGHT_NM, between, positive, setting, wavelengths_nm
 from neurolens.cameras.build import near_of
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.field import Field, Frame, diagonal_points, field_of, frame_of, lit_points, shown_at, spectrum_of
+from neurolens.cameras.field import (
+    Field,
+    Frame,
+    diagonal_points,
+    field_of,
+    frame_of,
+    lit_points,
+    on_axis,
+    shown_at,
+    spectrum_of,
+)
 from neurolens.cameras.sampling import focus_m
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import LENS_KEYS, Frames, frames_group
@@ -464,7 +474,7 @@ examples:
             field = field_of(camera, shot.focus_m, "equidistant", frame=frame, spectrum=spectrum)
         with progress.stage(f"fit {self.projection}"):
             fitted, left, told = handover.fitted_projection(
-                self.projection, field, self.picture, self.film, str(self.camera)
+                self.projection, field, self.picture, self.film, str(self.camera), complex(on_axis(camera)[0])
             )
         with progress.stage("trace other distances"):
             parallax = self.parallax(camera, field)

@@ -395,9 +395,11 @@ class FittedProjection:
 
 
 def fitted_projection(
-    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str
+    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str, axis_mm: complex = 0j
 ) -> tuple[projections.Projection, projections.Residual, FittedProjection]:
     """Fit a projection to a field; return the projection, what it leaves, and both as figures.
+
+    `axis_mm`: the picture point on the axis.
 
     Raises:
         InputError: as `projections.fit`.
@@ -408,7 +410,8 @@ def fitted_projection(
         focal = focal[0], focal[0]
     seen = lit_points(field, film_mm)
     shown, light = _shown(field, size, film_mm, seen), field.relative_light(seen)
-    fitted = projections.fit(kind, *shown, size, focal, source, light)
+    off = axis_mm.real / step[0], -axis_mm.imag / step[1]
+    fitted = projections.fit(kind, *shown, size, focal, source, light, off)
     ring = fitted.sharp_rad[:, None] + _BESIDE_PX / fitted.focal_px[0] * np.linspace(-1, 1, 33)
     ring = ring[(ring > 0) & (ring < fitted.widest_rad)]
     beside = field.point(np.stack([np.sin(ring), 0 * ring, np.cos(ring)]))

@@ -8,7 +8,7 @@ x' = x / z, y' = y / z, r^2 = x'^2 + y'^2, t the angle to z, and the pixel c + (
     kannala-brandt  (u, v) = d (x, y) / |(x, y)|, d = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): OpenCV's fisheye
     f-theta         the same with d = sum of a_i t^i in pixels, fy = 1, fx the c of NVIDIA's linear transformation
 
-A lens centred on its axis has p1 = p2 = 0 and its principal point in the picture's middle, so that neither is fitted;
+A lens centred on its axis has p1 = p2 = 0 and its principal point on the axis, so that neither is fitted;
 without cylinders it has fx = fy. All of these have one centre; `RayTable` has a ray of its own for every pixel.
 Sources: OpenCV, modules calib3d and fisheye; Kannala and Brandt 2006, IEEE PAMI 28(8); NVIDIA, documentation of NCore,
 sensor models; Schoeps et al. 2020, "Why Having 10,000 Parameters in Your Camera Model Is Better Than Twelve", CVPR.
@@ -64,6 +64,7 @@ class Projection:
         focal_px: fx, fy; for f-theta see the module.
         coefficients: in the order of the kind's names.
         widest_rad: the angle at which the picture ends.
+        off_px: from the middle of the picture to the axis, which a shifted film has elsewhere.
     """
 
     kind: str
@@ -71,11 +72,12 @@ class Projection:
     focal_px: tuple[float, float]
     coefficients: tuple[float, ...]
     widest_rad: float
+    off_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def centre_px(self) -> tuple[float, float]:
         """The principal point in pixels."""
-        return (self.size[0] - 1) / 2, (self.size[1] - 1) / 2
+        return (self.size[0] - 1) / 2 + self.off_px[0], (self.size[1] - 1) / 2 + self.off_px[1]
 
     @property
     def named(self) -> dict[str, float]:
@@ -195,6 +197,7 @@ def fit(
     focal_px: tuple[float, float],
     source: str = "projection",
     light: Array | None = None,
+    off_px: tuple[float, float] = (0.0, 0.0),
 ) -> Projection:
     """Fit a projection with the least mean squared distance from pixels, weighted by their light.
 
@@ -204,6 +207,7 @@ def fit(
         source: what errors name.
         light: [N] that arrives; None weights all alike. At the rim of an image circle only some colours arrive, and
             from elsewhere.
+        off_px: of the axis, as of `Projection`.
 
     Raises:
         InputError: the field is too wide for this kind, or there are fewer points than numbers.
@@ -214,7 +218,7 @@ def fit(
         raise InputError(source, f"--projection {kind}", f"({math.degrees(widest):.4g} degrees)", expected)
     if len(pixel) < 2 * len(NAMES[kind]) + 2:
         raise InputError(source, "picture", f"({len(pixel)} lit points)", "a picture that light reaches")
-    start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest)
+    start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest, off_px)
     # A ratio with one term too many spends it on a pole beside a zero: terms of the denominator are dropped until no
     # pole is left.
     weight = np.ones((1, 1)) if light is None else np.sqrt(light)[:, None]

@@ -220,6 +220,10 @@ def test_the_command_fits_a_lens_and_writes_what_programs_read(
     block = json.loads((tmp_path / "a.json").read_text())
     assert block["camera_model"] == "OPENCV" and (block["cx"], block["cy"], block["w"]) == (960.0, 540.0, 1920)
     assert "camera_matrix: !!opencv-matrix" in (tmp_path / "a.yaml").read_text()
+    monkeypatch.setattr("neurolens.cameras.field._OTHER", (33, 16))
+    moved = ["--film-shift", "3", "--film-rise", "-2"]  # the principal point lies to the left and above
+    told = run_json(capsys, "projection", GAUSS, *PICTURE, "--projection", "opencv", *moved)
+    assert told["rms_px"] < 0.05 and told["centre_px"] == pytest.approx([959.5 - 160, 539.5 - 2 * 1920 / 36])
     kinds = {"kannala-brandt": 0.5, "f-theta": 0.5}  # pixels RMS of 10 mm, 220 degrees
     for kind, most in kinds.items():
         told = run_json(capsys, "projection", FISHEYE, *PICTURE, "--projection", kind, "-o", tmp_path / kind)
