@@ -8,6 +8,7 @@ the turn does to the light, `to_film` the way back.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import warn
 from neurolens.graph.ir import Graph
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.lens.shot import Shot
+from neurolens.optics.lens.shot import POSES, Shot
 
 _HAIR = 1e-18  # mm; added so that the axis stays finite
 TURNS = "tilt_sin", "tilt_cos", "swing_sin", "swing_cos"  # inputs of a call, for a film that is turned at run time
@@ -41,8 +42,13 @@ class FilmPose:
     @staticmethod
     def of(shot: Shot) -> FilmPose:
         """Return how the film of a shot stands."""
-        moved = shot.film_shift_mm, shot.film_rise_mm
-        return FilmPose(math.radians(shot.film_tilt_deg), math.radians(shot.film_swing_deg), moved)
+        return FilmPose.in_settings(vars(shot))
+
+    @staticmethod
+    def in_settings(settings: Mapping[str, Any]) -> FilmPose:
+        """Return how the film of a camera of these settings stands; ideal cameras have none of `POSES`."""
+        tilt, swing, shift, rise = (settings.get(name) or 0.0 for name in POSES)
+        return FilmPose(math.radians(tilt), math.radians(swing), (shift, rise))
 
     def __bool__(self) -> bool:
         return self.turned or any(self.moved_mm)

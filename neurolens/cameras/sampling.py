@@ -14,6 +14,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import concentric_disk
 from neurolens.cameras.contract import Camera, CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.pose import FilmPose
 from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.trace.shapes import sag_mm
@@ -171,7 +172,7 @@ def focus_m(camera: Camera, shot: Shot) -> float:
 def axis_mm(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the film point [2] on a camera's axis, away from the middle of a film that is moved, and how far from the
     axis the film reaches along x and along y [2]."""
-    axis = np.array([camera.settings.get(name) or 0.0 for name in ("film_shift_mm", "film_rise_mm")])
+    axis = np.array(FilmPose.in_settings(camera.settings).moved_mm)
     return axis, np.array(camera.film_mm) / 2 + np.abs(axis)
 
 

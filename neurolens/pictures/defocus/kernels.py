@@ -454,11 +454,15 @@ def diffracted(camera: Camera, size: tuple[int, int], cells: Sequence[Cell], wav
 
 
 def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:
-    """Return an empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film."""
-    frame = frame_of(camera)
+    """Return an empty plate of the camera's own pinhole, that of `neurolens stmap`, with `size` pixels on its film.
+
+    It moves with the film, so that a point is about where the film shows it.
+    """
+    frame, axis = frame_of(camera), axis_mm(camera)[0]
     per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
     reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
-    return Plate([], PlatePinhole(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1]), size)
+    centre = size[0] / 2 - per_mm[0] * axis[0], size[1] / 2 + per_mm[1] * axis[1]
+    return Plate([], PlatePinhole(reach, centre, frame.pupil_mm[1]), size)
 
 
 def kernels_over(

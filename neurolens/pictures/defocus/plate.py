@@ -30,6 +30,8 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.field import Frame
+from neurolens.cameras.pose import FilmPose
+from neurolens.cameras.sampling import axis_mm
 from neurolens.pictures.defocus.deep import OPAQUE, deep_layers
 from neurolens.pictures.render.colour import SRGB, ColourSpace, SpectralRange, conversion, converted
 from neurolens.pictures.render.pictures import (
@@ -404,7 +406,7 @@ def turned(square: NDArray[Any], angle_rad: NDArray[Any]) -> FloatArray:
 def turns_pupil(camera: Camera) -> bool:
     """Test whether a camera's pupil samples turn about the axis with the film point, as those of round lenses do."""
     reach = 0.01 * min(camera.film_mm)
-    film = np.repeat(np.array([[reach, 0.0], [0.0, reach]], np.float32), 2, axis=1)
+    film = np.repeat(axis_mm(camera)[0][:, None] + reach * np.eye(2), 2, axis=1).astype(np.float32)
     pupil = np.tile(np.array([[0.9, 0.5], [0.5, 0.9]], np.float32), 2)
     low, high = camera.wavelength_nm or LIGHT_NM
     x, y, _ = camera.sample(film, pupil, np.full(4, min(max(MIDDLE_NM, low), high), np.float32)).origin_m
@@ -460,7 +462,11 @@ class RayTable:
 
     def unturned(self, film_mm: FloatArray, pupil: FloatArray) -> FloatArray:
         """Return the samples that the camera takes to pupil points [2, N], seen from film points [2, N]."""
-        return turned(pupil, -np.arctan2(film_mm[1], film_mm[0])) if self.turns else pupil
+        if not self.turns:
+            return pupil
+        pose = FilmPose.in_settings(self.camera.settings)
+        x, y = pose.axes[:2, :2] @ (film_mm - np.array(pose.moved_mm)[:, None])
+        return turned(pupil, -np.arctan2(y, x))
 
     def _lines(self, film: FloatArray, pupil: FloatArray, nm: FloatArray) -> FloatArray:
         found = np.empty((len(nm), NUMBERS), np.float32)

@@ -329,6 +329,20 @@ def test_kernels_of_white_points_have_the_light_that_passes_the_pupil_in_each_co
     assert kernel.tinted(tint(camera)).energy.sum() == pytest.approx(expected.sum(), rel=5e-3)
 
 
+def test_a_point_on_the_axis_of_a_moved_film_has_the_disc_of_a_centred_one() -> None:
+    """The pupil turns about the axis, wherever the film has its middle: 4 and 2 mm are 100 and 50 pixels."""
+    shot, found = Shot((24.0, 16.0), 3.0, 4.0), list[np.ndarray]()
+    for moved, at in ({}, (300.0, 200.0)), ({"film_shift_mm": 4.0, "film_rise_mm": -2.0}, (200.0, 150.0)):
+        camera = make_camera(str(ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"), replace(shot, **moved))
+        plate = own_plate(camera, (600, 400))
+        assert plate.pinhole.centre_px == pytest.approx(at)
+        kernel = kernel_at(camera, plate, at, 1.0, at)
+        assert kernel is not None
+        assert kernel.middle_px == pytest.approx(at, abs=0.01)
+        found.append(kernel.light)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-3 * found[0].max())
+
+
 def test_the_middle_of_a_disc_on_the_axis_is_smooth() -> None:
     """The light in the middle five pixels continues the parabola about them, on the axis and one pixel beside it."""
     size = (3840, 2560)
