@@ -34,6 +34,7 @@ from neurolens.pictures.defocus.plate import (
     Plate,
     PlatePinhole,
     RayTable,
+    axis_px,
     channel_wavelengths,
     turned,
 )
@@ -458,11 +459,10 @@ def own_plate(camera: Camera, size: tuple[int, int]) -> Plate:
 
     It moves with the film, so that a point is about where the film shows it.
     """
-    frame, axis = frame_of(camera), axis_mm(camera)[0]
+    frame, axis = frame_of(camera), axis_px(camera, size)
     per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
     reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
-    centre = size[0] / 2 - per_mm[0] * axis[0], size[1] / 2 + per_mm[1] * axis[1]
-    return Plate([], PlatePinhole(reach, centre, frame.pupil_mm[1]), size)
+    return Plate([], PlatePinhole(reach, axis, frame.pupil_mm[1]), size, axis_px=axis)
 
 
 def kernels_over(

@@ -33,7 +33,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import WIDEST_DEG
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.pictures.defocus.kernels import LARGEST, kernel_at, tint
-from neurolens.pictures.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable, reduced
+from neurolens.pictures.defocus.plate import FINEST, NUMBERS, FloatArray, Plate, RayTable, axis_px, reduced
 from neurolens.pictures.render.sampler import sobol
 
 _SET = 512  # points of the pupil in a set
@@ -356,6 +356,7 @@ def defocus(
     """
     progress = progress or Progress(quiet=True)
     check_field(camera)
+    plate = replace(plate, axis_px=axis_px(camera, plate.size))
     spread = spread_over(camera, plate)
     taken = [take_highlights(plate, k, spread) for k in range(len(plate.layers)) if highlights]
     with progress.stage(f"blur by {camera.name}") as report:

@@ -117,17 +117,22 @@ class _Struct(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate: its layers, front first, its pinhole, and the size and colour space of the picture to take of it."""
+    """A plate: its layers, front first, its pinhole, and the size and colour space of the picture to take of it.
+
+    `axis_px` is where that picture has the axis, None in its middle.
+    """
 
     layers: list[Layer]
     pinhole: PlatePinhole
     size: tuple[int, int]
     space: ColourSpace = SRGB
+    axis_px: tuple[float, float] | None = None
 
     @property
     def border_px(self) -> tuple[float, float]:
         """Return how far its first pixel lies beyond the first pixel of the picture: the overscan."""
-        return self.pinhole.centre_px[0] - self.size[0] / 2, self.pinhole.centre_px[1] - self.size[1] / 2
+        (x, y), (across, down) = self.pinhole.centre_px, self.axis_px or (self.size[0] / 2, self.size[1] / 2)
+        return x - across, y - down
 
     def structs(self) -> Any:
         """Return the layers as an array of C's structures; it keeps the memory to which these point."""
@@ -412,6 +417,12 @@ def turns_pupil(camera: Camera) -> bool:
     x, y, _ = camera.sample(film, pupil, np.full(4, min(max(MIDDLE_NM, low), high), np.float32)).origin_m
     first, second = (x + 1j * y)[::2] - (x + 1j * y)[1::2]
     return bool(abs(second - 1j * first) < abs(second - first))
+
+
+def axis_px(camera: Camera, size: tuple[int, int]) -> tuple[float, float]:
+    """Return where a camera's picture of this size has the axis: away from its middle on a film that is moved."""
+    (shift, rise), (width, height) = axis_mm(camera)[0], camera.film_mm
+    return size[0] * (0.5 - shift / width), size[1] * (0.5 + rise / height)
 
 
 class RayTable:

@@ -343,6 +343,20 @@ def test_a_point_on_the_axis_of_a_moved_film_has_the_disc_of_a_centred_one() -> 
     np.testing.assert_allclose(found[1], found[0], atol=1e-3 * found[0].max())
 
 
+def test_a_moved_film_takes_the_highlights_at_its_edge() -> None:
+    """The plate's pinhole is not moved: its light 16 mm right of the axis is 4 mm from the middle of the film."""
+    camera = make_camera(
+        str(ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"), Shot((24.0, 16.0), 1.0, 2.0, film_shift_mm=12.0)
+    )
+    size, rgb, w = (120, 80), np.zeros((80, 240, 3), np.float32), np.zeros((80, 240), np.float32)
+    rgb[40, 200] = 1000.0
+    frame = frame_of(camera)
+    pinhole = PlatePinhole((frame.reach_mm[0] * 5, frame.reach_mm[1] * 5), (120.0, 40.0), frame.pupil_mm[1])
+    found = defocus(Plate([Layer(rgb, w)], pinhole, size), camera, 8)
+    assert found.highlights == 1 and 700 < found.rgb[..., 1].sum() < 1000  # less the lens's vignetting
+    assert found.rgb[..., 1].sum(0).argmax() == pytest.approx(60 + 20, abs=4)
+
+
 def test_the_middle_of_a_disc_on_the_axis_is_smooth() -> None:
     """The light in the middle five pixels continues the parabola about them, on the axis and one pixel beside it."""
     size = (3840, 2560)
