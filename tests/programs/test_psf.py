@@ -143,6 +143,15 @@ def gauss(focus_m: float) -> Lens:
     )
 
 
+def test_places_without_light_are_said_to_be_dark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not to have their light beyond the pixels: the film is larger than what the lens covers."""
+    words = ["psf", LENS, "--film", "200x20", "--grid", "3x1", "--f-number", "8", "--wavelengths", "550"]
+    assert main([*words, "-o", str(tmp_path / "a.npz")]) == 0
+    told = capsys.readouterr()
+    assert "2 of 3 point spreads are dark" in told.err and "beyond" not in told.err
+    assert p.read_psf(tmp_path / "a.npz")[1]["light"].tolist() == [[[[0, 1, 0]]]]
+
+
 @pytest.mark.parametrize("distance_m", [2.0, math.inf])
 def test_a_lens_moved_aside_as_a_whole_has_its_image_moved(distance_m: float) -> None:
     """It is no longer round: its object points are found another way. Far objects stay where they are."""
