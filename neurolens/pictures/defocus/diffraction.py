@@ -3,9 +3,9 @@
 Rays place light as geometry does, and waves then spread it. The blur of a point is here the blur of its rays convolved
 with the point spread that the same pupil (stop, blades, rims) has without aberrations. Far out of focus and near a
 perfect focus this is what sums of waves give; between, where aberrations are about a wave, it spreads too much. The
-pupil hardly depends on the depth of things, so that one kernel serves all depths of a zone. Nor does it on that of the
-film: a zone of a turned film has the kernel of the upright film where the pupil sees it, whose width errs by the share
-by which the zone is nearer to the pupil or farther, and by the cosine of the turn. Kernels reach out to 118
+pupil hardly depends on the depth of things, so that one kernel serves all depths of a zone. A zone of a turned film has
+the kernel of the upright film where the pupil sees it, as the turned film cuts that light (`_cut`): at 20 degrees the
+width is within 1% of that of waves summed on the turned film, for things that are sharp there. Kernels reach out to 118
 radii of Airy's disc or 127 pixels, whichever is less, and hold the streaks of blades so far; the light beyond is put
 back into them.
 """
@@ -32,6 +32,7 @@ Place = tuple[float, float]
 MOST_PX = 255  # pixels along a side of the point spread
 _COLOURS = 3  # wavelengths in a channel of a sensor
 _ZONES = (5, 3)
+_STEP_MM = 1e-3  # of differences on the film
 _REACH = 72  # wavelengths over the half width of the pupil, in cosines: what the finest grid resolves
 
 
@@ -136,6 +137,8 @@ class Diffraction:
         focus_m = camera.settings.get("focus_m") or math.inf
         places, pixel_mm = on_upright(camera, places_of(camera.film_mm, _ZONES)), camera.film_mm[0] / size[0]
         made = np.array([s.light for s in spreads(lens, focus_m, places, channels, pixel_mm, perfect=True)])
+        if camera.film.pose.turned:  # type: ignore[attr-defined]
+            made = np.array([_cut(camera, *each) for each in zip(places_of(camera.film_mm, _ZONES), made, strict=True)])
         made = np.broadcast_to(made, (len(made), 3, *made.shape[2:])).copy()
         dark = made.sum((2, 3)) == 0
         made[dark, made.shape[2] // 2, made.shape[3] // 2] = 1
@@ -184,6 +187,18 @@ def on_upright(camera: Any, places_mm: Sequence[Place]) -> list[Place]:
     x, y, depth = pose.axes[:, :2] @ (-np.array(places_mm) - pose.moved_mm).T
     away = np.maximum(1 + depth / camera.film.distance_mm, 0.1)  # the film of a short lens may reach its pupil
     return list(zip((-x / away).tolist(), (-y / away).tolist(), strict=True))
+
+
+def _cut(camera: Any, place_mm: Place, kernels: Array) -> Array:
+    """Return kernels [C, side, side] of the upright film as the film of a camera cuts their light at a place."""
+    from scipy.ndimage import affine_transform  # type: ignore[import-untyped]
+
+    down, right = np.array([[0, -_STEP_MM], [_STEP_MM, 0]])
+    ends = np.array(on_upright(camera, [np.add(place_mm, d) for d in (down, -down, right, -right)]))
+    moves = (ends[::2] - ends[1::2])[:, ::-1].T * [[-1], [1]] / (2 * _STEP_MM)  # of row and column by row and column
+    middle = np.full(2, kernels.shape[-1] // 2)
+    turned = [affine_transform(k, moves, middle - moves @ middle) for k in kernels]
+    return np.maximum(turned, 0)
 
 
 def lens_of(camera: Any) -> Lens:
