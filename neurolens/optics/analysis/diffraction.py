@@ -5,10 +5,10 @@ the exit pupil (`exit_pupil`; Debye; Born and Wolf, section 8.8). Here it is sum
 those on the edge of a rim or a blade count by their open part, as two products of matrices. |U|^2 integrates to the
 light that arrives, so that shares of it need no scale. A pixel takes the mean over its area.
 
-Far out of focus the fringes are finer than pixels, and the grid would need too many cells. There the rays of the same
-pupil are counted by pixels (`Spread.by_rays`): the light of a cell fills a rectangle, of which pixels have their
-shares. Where both are known, `Spread.differs` tells how much light they place in different pixels: some 6% of white
-light on pixels of 3 um, where rays take over at f/2.8.
+Far out of focus the fringes are finer than pixels, and the grid would need too many cells for the place's own rays.
+There the rays of the same pupil are counted by pixels (`Spread.by_rays`): the light of a cell fills a rectangle, of
+which pixels have their shares. Where both are known, `Spread.differs` tells how much light they place in different
+pixels: some 6% of white light on pixels of 3 um, where rays take over at f/2.8.
 """
 
 from __future__ import annotations
@@ -141,6 +141,12 @@ def cells_needed(pupil: ExitPupil, reach_mm: Array | float) -> tuple[int, int]:
     return across, down
 
 
+def _resolved_mm(pupil: ExitPupil) -> Array:
+    """Return how far from the centre the finest grid resolves diffraction, the inverse of `cells_needed`."""
+    cycles = (FINEST - _FEWEST) / _PER_CYCLE
+    return np.asarray(cycles * pupil.wavelength_nm * 1e-6 / (2 * pupil.half) - pupil.blurs_mm)
+
+
 def reach_of(pupils: Sequence[ExitPupil | None]) -> float:
     """Return how far (mm) a window must reach from its centre to hold the rays and six Airy radii."""
     some = [p for p in pupils if p is not None]
@@ -162,11 +168,19 @@ def _centre(pupils: Sequence[ExitPupil]) -> Array:
 def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, side: int) -> Spread:
     """Return the point spread of a place.
 
+    Where the finest grid resolves the place's own rays and six Airy radii, but not the whole window, the pixels beyond
+    what it resolves stay dark.
+
     Args:
         pupils: by wavelength; None is dark. weights: [C, W] of wavelengths in each channel.
         pixel_mm, side: pixels, and how many along a side.
     """
-    reach, centre = side * pixel_mm / 2, _centre([p for p in pupils if p is not None])
+    every = [p for p in pupils if p is not None]
+    centre = _centre(every)
+    resolved = [float((_resolved_mm(p) - np.abs(p.centre_mm - centre)).min()) for p in every]
+    unseen = max(math.ceil(side / 2 - min(resolved, default=0.0) / pixel_mm), 0)  # pixels on each side of the window
+    reach = (side / 2 - unseen) * pixel_mm
+    by_rays = unseen > 0 and reach < reach_of(every)
     needed = {k: cells_needed(p, reach + np.abs(p.centre_mm - centre)) for k, p in enumerate(pupils) if p is not None}
     lit = sorted(needed, key=lambda k: -max(needed[k]))
     some, weights = [p for k in lit if (p := pupils[k]) is not None], weights[:, lit]
@@ -175,7 +189,6 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
         return Spread(np.zeros((len(weights), side, side)), centre, dark, dark, False, math.nan)
     blur = max(p.blur_mm for p in some)
     rays = min(max(_FEWEST_RAYS, 8 * math.ceil(_RAYS_PER_PIXEL * 2 * blur / pixel_mm / 8)), _MOST_CELLS)
-    by_rays = max(needed[lit[0]]) > FINEST
     line = (np.arange(side) - (side - 1) / 2) * pixel_mm
     parts, done = list[tuple[Array, ...]](), 0
     while done < len(some):
@@ -187,7 +200,9 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
         area = np.prod([2 * p.half for p in group], 1) / (across * down)
         counted = spent = _by_rays(group, x, y, pixel_mm, light * share, rays) * area[:, None, None]
         if not by_rays:
-            spent = by_pixel(group, x, y, pixel_mm, phasor(cycles, np.sqrt(light) * weight))
+            seen = slice(unseen, side - unseen)
+            spent = by_pixel(group, x[:, seen], y[:, seen], pixel_mm, phasor(cycles, np.sqrt(light) * weight))
+            spent = np.pad(spent, [(0, 0), (unseen, unseen), (unseen, unseen)])
         parts.append((counted, spent, *((s.sum((1, 2), dtype=np.float64) * area) for s in (light * share, share))))
     *images, total, solid = (np.concatenate(part) for part in zip(*parts, strict=True))
     energy = weights @ total

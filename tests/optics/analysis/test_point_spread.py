@@ -143,6 +143,10 @@ def test_all_light_is_in_the_image() -> None:
     [small, large] = (spread([pupil], ONE, 0.004, side) for side in (31, 121))
     assert small.inside[0] < large.inside[0] < 1
     assert large.inside[0] == pytest.approx(1, abs=3e-3)
+    # A window wider than waves can be summed for has the same image in its middle: rays do not take over in focus.
+    whole = spread([pupil], ONE, 0.004, 401)
+    assert not whole.by_rays and whole.inside[0] == pytest.approx(1, abs=3e-3)
+    assert whole.light[0, 140:-140, 140:-140] == pytest.approx(large.light[0], abs=0.01 * large.light.max())
     # Pixels tile: four small ones hold what a large one holds.
     x, near = np.arange(-6, 7)[None] * 0.004, np.arange(-13, 13)[None] * 0.002 + 0.001
     field = cells_of(pupil, (256, 256))[None]

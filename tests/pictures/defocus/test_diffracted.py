@@ -94,7 +94,7 @@ def test_a_turned_film_cuts_the_waves_where_it_stands(monkeypatch: pytest.Monkey
     pupil = pupil.perfect()
     cosines = pupil.middle[:, None, None] + pupil.half[:, None, None] * np.stack(np.meshgrid(*[middles(96)] * 2)[::-1])
     waves = np.stack([*cosines, np.sqrt(1 - (cosines**2).sum(0))]).reshape(3, -1).T @ axes * (2e6 * math.pi / NM)
-    field, line = cells_of(pupil, 96).reshape(-1), (np.arange(63) - 31) / 3 * pixel
+    field, line = cells_of(pupil, (96, 96)).reshape(-1), (np.arange(63) - 31) / 3 * pixel
     sums = np.exp(1j * np.outer(line, waves[:, 1])) * field @ np.exp(1j * np.outer(line, waves[:, 0])).T
     wanted = (np.abs(sums) ** 2).reshape(21, 3, 21, 3).mean((1, 3))[:, ::-1]
     middle = len(found) // 2 + np.arange(-10, 11)
