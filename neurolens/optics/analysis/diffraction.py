@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import affine_transform  # type: ignore[import-untyped]
 
 from neurolens.optics.analysis.bundles import Aim, Filled
 from neurolens.optics.analysis.exit_pupil import (
@@ -211,6 +212,12 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
     )
     differs = math.nan if by_rays else float(np.abs(shown - by_hits).sum() / 2 / len(weights))
     return Spread(shown, centre, shown.sum((1, 2)), weights @ solid, by_rays, differs)
+
+
+def stretched(images: Array, moves: Array) -> Array:
+    """Return images [N, side, side] that have at an offset from the middle what these have at `moves` [2, 2] times it."""
+    middle = np.full(2, (images.shape[-1] - 1) / 2)
+    return np.maximum([affine_transform(image, moves, middle - moves @ middle) for image in images], 0)
 
 
 def irradiance(pupil: ExitPupil, x_mm: Array, y_mm: Array, field: Field) -> Array:

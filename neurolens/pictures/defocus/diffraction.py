@@ -191,14 +191,12 @@ def on_upright(camera: Any, places_mm: Sequence[Place]) -> list[Place]:
 
 def _cut(camera: Any, place_mm: Place, kernels: Array) -> Array:
     """Return kernels [C, side, side] of the upright film as the film of a camera cuts their light at a place."""
-    from scipy.ndimage import affine_transform  # type: ignore[import-untyped]
+    from neurolens.optics.analysis.diffraction import stretched
 
     down, right = np.array([[0, -_STEP_MM], [_STEP_MM, 0]])
     ends = np.array(on_upright(camera, [np.add(place_mm, d) for d in (down, -down, right, -right)]))
     moves = (ends[::2] - ends[1::2])[:, ::-1].T * [[-1], [1]] / (2 * _STEP_MM)  # of row and column by row and column
-    middle = np.full(2, kernels.shape[-1] // 2)
-    turned = [affine_transform(k, moves, middle - moves @ middle) for k in kernels]
-    return np.maximum(turned, 0)
+    return stretched(kernels, moves)
 
 
 def lens_of(camera: Any) -> Lens:
