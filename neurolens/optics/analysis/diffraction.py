@@ -215,7 +215,7 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
 
 
 def stretched(images: Array, moves: Array) -> Array:
-    """Return images [N, side, side] that have at an offset from the middle what these have at `moves` [2, 2] times it."""
+    """Return images [N, side, side] with at offsets from the middle what these have at `moves` [2, 2] times it."""
     middle = np.full(2, (images.shape[-1] - 1) / 2)
     return np.maximum([affine_transform(image, moves, middle - moves @ middle) for image in images], 0)
 
