@@ -35,6 +35,7 @@ suppress_warnings = ["ref.python"]  # classes of one name in two modules: a sign
 html_theme = "pydata_sphinx_theme"
 html_context = {"default_mode": "auto"}
 html_theme_options = {"show_prev_next": False, "footer_start": [], "footer_end": []}
+html_sidebars = {f"docs/pages/{page}": [] for page in ("first-hour", "explanation", "papers")}  # pages without a menu
 html_extra_path = ["index.html"]  # leads to the first page
 html_static_path = ["static"]
 html_css_files = ["style.css"]
@@ -53,7 +54,7 @@ def setup(app: Any) -> None:
 
 def _commands() -> str:
     """The help of every command."""
-    os.environ["COLUMNS"] = "110"
+    os.environ["COLUMNS"] = "100"
     from neurolens.cli import main
 
     def help_of(*words: str) -> str:
@@ -88,8 +89,8 @@ def _module(name: str) -> str:
 
 
 def _prepare(app: Any, document: str, content: list[str]) -> None:
-    """Index pages and that of results get the menu of what they link to; pages outside docs/pages are in no menu; files
-    show their name.
+    """Index pages and that of results get the menu of what they link to, under their headings; pages outside docs/pages
+    are in no menu; files show their name.
 
     Links to HTML pages stay links: Sphinx would take them for downloads, without what lies beside them.
     """
@@ -101,8 +102,11 @@ def _prepare(app: Any, document: str, content: list[str]) -> None:
         content[0] = f"---\norphan: true\n---\n{content[0]}"
     elif document.endswith(("/index", "/results")):
         own = "results/" if document.endswith("/results") else ""  # other pages that they name are in other menus
-        pages = re.findall(rf"\]\(({own}[\w-]+(?:/index)?)\.md\)", content[0])
-        content[0] += "\n```{toctree}\n:hidden:\n:maxdepth: 2\n\n" + "\n".join(dict.fromkeys(pages)) + "\n```\n"
+        for part in re.split(r"^## ", content[0], flags=re.MULTILINE):
+            pages = dict.fromkeys(re.findall(rf"\]\(({own}[\w-]+(?:/index)?)\.md\)", part))
+            head = "" if part.startswith("# ") else f":caption: {part.partition(chr(10))[0]}\n"
+            if pages:
+                content[0] += f"\n```{{toctree}}\n:hidden:\n:maxdepth: 2\n{head}\n" + "\n".join(pages) + "\n```\n"
 
 
 def _to_restructured_text(app: Any, what: str, name: str, of: object, options: Any, lines: list[str]) -> None:

@@ -353,7 +353,8 @@ def load(model: str | os.PathLike[str]) -> Model:
     """
     file = lensname.resolve(os.fspath(model), cameras=False).file
     if file is None or not lensname.is_model(file):
-        raise InputError("nl.load", "model", str(file), "an exported model (.onnx)")
+        expected = "an exported model (.onnx): `neurolens models` lists those that ship, nl.fit makes one of a lens"
+        raise InputError("nl.load", "model", str(file or model), expected)
     return Model(read_model(file))
 
 

@@ -11,7 +11,11 @@ from hypothesis import settings
 from shipped import WHOLE
 
 from neurolens import cli
+from neurolens.base.progress import Progress
+from neurolens.cameras import build
+from neurolens.cameras.contract import Camera
 from neurolens.graph import compiler
+from neurolens.optics.lens.shot import Shot
 
 # A ball in white light.
 SCENE = """\
@@ -59,6 +63,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     gc.freeze()  # what is imported and collected stays: no need to look through it again and again
+    gc.set_threshold(50_000)  # graphs are tens of thousands of tuples, of which few are garbage
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -67,7 +72,7 @@ def quick_races() -> Iterator[None]:
     judges a clock."""
     flags = ("-std=c99", "-O0", "-march=native")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-O1") for flag in compiler.FLAGS))
+        patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-Og") for flag in compiler.FLAGS))
         # What is compiled and searched for one test is there for the next, in both processes.
         patch.setattr(compiler, "_KEPT", 4096)
         patch.setattr("neurolens.cameras.exact._KEPT", 4096)
@@ -79,6 +84,21 @@ def quick_races() -> Iterator[None]:
         patch.setattr("neurolens.studies.speed._SAMPLES", 1)
         patch.setattr("neurolens.studies.plan.costs._STRIP_PATHS", 12_000)
         yield
+
+
+@pytest.fixture
+def one_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands of a test that ask for the same camera share it: each would write and open the same programs again."""
+
+    @cache
+    def made(spec: str, shot: Shot) -> Camera:
+        return build.make_camera(spec, shot)
+
+    def shared(spec: str | Path, shot: Shot, progress: Progress | None = None) -> Camera:
+        return made(str(spec), shot)
+
+    monkeypatch.setattr("neurolens.pictures.frames.make_camera", shared)
+    monkeypatch.setattr("neurolens.cli.arguments.camera", lambda name, shot, progress: made(name, shot))
 
 
 @pytest.fixture

@@ -130,6 +130,8 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         (["lens", GAUSS, "--foc", "1"], ["--foc 1; did you mean '--focus'?"]),
         (["lens", GAUSS, "--aperture", "2"], ["--aperture 2; did you mean '--f-number'?"]),  # as other programs say
         (["stmap", GAUSS, "--resolution", "64"], ["--resolution 64; did you mean '--width'?"]),
+        (["render", "room"], ["--camera: got (missing)", "one scene and one camera"]),
+        (["render", "room", GAUSS], ["SCENE: got '", "one scene and one camera"]),
         (["render", "room", "--fnumber=2"], ["--fnumber=2; did you mean '--f-number'?", "neurolens render --help"]),
         (["lens", GAUSS, "-o", "a.toml"], ["-o"]),
         (["lens", GAUSS, "--derive-rims", "--layout", "a.png"], ["--layout"]),

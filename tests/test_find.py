@@ -51,6 +51,7 @@ LENSES = Path(__file__).parents[1] / "lenses"
         ("master prime", "zeiss_arri_master_prime_t1_3_100mm"),
         ("arri T1.3", "zeiss_arri_master_prime_t1_3_100mm"),
         ("canon ef 70-200", "canon_ef_70_200mm_"),
+        ("mft 25", "panasonic_"),
         ("canon zoom 16-35 2.8 iii", "canon_ef_16_35mm_f2_8l_iii_usm"),
         ("olympus 45", "olympus_m_zuiko_ed_45mm_f1_2_pro"),
         ("minolta smooth trans focus", "minolta_135mm_f2_8_t4_5_stf"),
@@ -117,9 +118,16 @@ def test_a_text_is_read_as_it_is_engraved() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "stated"), [("tilt", "most_tilt_deg ="), ("shift", "most_shift_mm ="), ("anamorphic", "cylinder")]
+    ("word", "stated"),
+    [
+        ("tilt", "most_tilt_deg ="),
+        ("shift", "most_shift_mm ="),
+        ("anamorphic", "cylinder"),
+        ("micro four thirds", 'mount = "Micro Four Thirds'),
+        ("canon ef", 'mount = "Sigma SA, Canon EF'),
+    ],
 )
-def test_a_kind_finds_every_lens_whose_file_states_it(word: str, stated: str) -> None:
+def test_a_kind_or_mount_finds_every_lens_whose_file_states_it(word: str, stated: str) -> None:
     files = {file.stem for file in LENSES.glob("*.toml") if stated in file.read_text(encoding="utf-8")}
     assert files and files <= {entry.lens for entry in find(word).hits}
 

@@ -249,6 +249,9 @@ def test_rays_have_the_settings_of_a_lens_or_camera_unless_the_call_has_its_own(
         np.testing.assert_array_equal(ours["direction"], theirs["direction"])
     assert (set_["direction"] != far["direction"]).any()
     assert (nl.rays(lens.set(blades=3), film, **small)["direction"] != set_["direction"]).any()
+    tiny = {"focal_length_mm": 14, "samples": 1}  # a lens made so small covers a phone's film
+    usual, said = nl.rays(TRIPLET, **tiny), nl.rays(TRIPLET, (5.6, 4.2), width=480, **tiny)
+    np.testing.assert_array_equal(usual["direction"], said["direction"])
     camera = nl.camera(TRIPLET, film=(24, 16), focus_m=2, vignetting="none")
     ours, theirs = nl.rays(camera, **small), nl.rays(TRIPLET, (24, 16), focus_m=2, vignetting="none", **small)
     for name in ("direction", "weight"):

@@ -63,7 +63,8 @@ def check(line: str, words: list[str], made: set[Path]) -> None:
         for each in value if isinstance(value, list | tuple) else [value]:
             file = Path(split_kind(each)[1]) if name == "camera" and isinstance(each, str) else each
             if isinstance(file, Path) and name not in WRITTEN and file.name not in {"list", *lensname.IDEAL}:
-                assert exists(file, made), f"{line}: nothing makes {file}"
+                named = name == "files" and not exists(file, made) and lensname.resolve(file, cameras=False)
+                assert named or exists(file, made), f"{line}: nothing makes {file}"
     if (out := getattr(args, "output", None) or getattr(args, "out", None)) is not None:
         assert exists(out.parent, made) or "runs" in out.parts, f"{line}: no folder {out.parent}"
         tiles = [out.with_name(f"{out.stem}.tile-*{out.suffix}")] if getattr(args, "tile", None) else []

@@ -1,4 +1,4 @@
-// A camera node of Arnold around a whole camera of neurolens: see docs/pages/how-to/shading.md.
+// A camera node of Arnold around a whole camera of neurolens: see docs/pages/how-to/karma-arnold.md.
 //
 //   neurolens export MODEL --to c --whole-camera --focus 2 --f-number 2 --derivatives --name lens -o lens.h
 //   g++ -O3 -march=native -fPIC -shared -I. -I$ARNOLD/include neurolens_camera.cpp -o neurolens_camera.so -L$ARNOLD/bin -lai

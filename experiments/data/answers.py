@@ -239,13 +239,20 @@ def methods() -> Answer:
         [("python -m experiments surrogates laikin_double_gauss_50", "surrogates/laikin_double_gauss_50.md")],
         "One lens, the 50 mm f/1.8 double Gauss, at full aperture and field. The published methods are our "
         "implementations of [their papers](../papers.md), fitted on the same rays and written by the same writers. "
-        "The tables of rays were meant for a GPU and are judged on a CPU here. Of two models of 2026 we know what "
-        "their authors state, of other lenses: precomputed lens transport maps draw flare in 74.4 s, where tracing "
-        "takes 1,180 s, at one zoom and stop; Ray2Ray leaves about 1 um and 0.01 degrees, by its abstract. "
-        "The lens is coated: each method has terms for its transmittance, which the papers lack. " + MACHINE,
+        "POTA and lentil, plug-ins of Arnold, are after Schrade 2016. The tables of rays were meant for a GPU and are "
+        "judged on a CPU here. Each method has terms for the transmittance of the coated lens, which the papers lack. "
+        "We did not run two models of 2026, of which their authors state figures for other lenses. Precomputed "
+        "lens transport maps draw flare in 74.4 s, where tracing takes 1,180 s. Ray2Ray leaves about 1 um and 0.01 "
+        "degrees. " + MACHINE,
         [
-            ("experiments/results/surrogates/ogawa_zoom_70_200.md", "the same through a bare 70-200 zoom, earlier"),
-            ("experiments/results/surrogates/phone_lens_6.md", "the same through a bare phone lens, earlier"),
+            (
+                "experiments/results/surrogates/ogawa_zoom_70_200.md",
+                "the same through a 70-200 zoom of bare glass, by an earlier state of our models",
+            ),
+            (
+                "experiments/results/surrogates/phone_lens_6.md",
+                "the same through a phone lens of bare glass, by an earlier state of our models",
+            ),
             ("experiments/results/library/summary.md", "two methods over the whole library"),
         ],
     )

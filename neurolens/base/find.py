@@ -80,13 +80,15 @@ class Entry:
         lens: its name in lenses/.
         row: its row of the index; empty without one.
         own: the words of its own name.
-        words: all its words, those of its name first.
+        words: all its words.
+        mounts: those that its mounts alone have, which weigh less: a Sigma for Canon EF is no Canon.
     """
 
     lens: str
     row: Mapping[str, Any]
     own: frozenset[str]
     words: frozenset[str]
+    mounts: frozenset[str]
 
     @classmethod
     def of(cls, lens: str, row: Mapping[str, Any]) -> Entry:
@@ -99,12 +101,13 @@ class Entry:
             "anamorphic" if row.get("efl_x_mm") else "",
             *(k for n, k in _KINDS.items() if re.search(n, _plain(name))),
         ]
-        more = words_of(" ".join([*(str(row.get(key) or "") for key in ("name", "maker", "mount")), lens, *kinds]))
+        more = words_of(" ".join([*(str(row.get(key) or "") for key in ("name", "maker")), lens, *kinds]))
         spans = [word[:-2].split("-") for word in own if re.fullmatch(rf"{_N}-{_N}mm", word)]
         more += [*(end for span in spans for end in span), "zoom" if spans else "prime"]
         more += [f"{row['year']}", f"{row['year'] // 10}0s"] if row.get("year") else []
         more += [] if "f/" in " ".join(own) or not row.get("f_number") else [f"f/{row['f_number']:.2g}"]
-        return cls(lens, row, frozenset(own), frozenset([*own, *more]))
+        mounts = frozenset(words_of(row.get("mount") or "")).difference(own, more)
+        return cls(lens, row, frozenset(own), mounts.union(own, more), mounts)
 
     @property
     def name(self) -> str:
@@ -124,7 +127,7 @@ class Entry:
     def agrees(self, word: str) -> int:
         """Return how well a word of a query agrees with the lens, 0 for not at all."""
         if not self.words.isdisjoint({word, f"{word}mm", f"f/{word}"} if word[0].isdigit() else {word}):
-            return _WHOLE
+            return _BEGUN if word in self.mounts else _WHOLE
         if not word.isalpha() or len(word) < 3:
             return 0
         begun = any(own.startswith(word) or (len(own) > 3 and word in (own + "s", own + "es")) for own in self.words)

@@ -36,6 +36,7 @@ from neurolens.cameras.sampling import FrontDiscs, arrived
 from neurolens.graph.c import padded_columns
 from neurolens.graph.compiled import CompiledGraph
 from neurolens.graph.compiler import has_compiler
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
@@ -46,9 +47,9 @@ from neurolens.optics.trace.shapes import sag_and_derivatives
 
 Array = NDArray[np.float64]
 
-# What a camera computes: rays, rays with differentials, rays with companions, or whether companions pass
+# What a camera computes: rays, a few of them, rays with differentials, rays with companions, or whether companions pass
 # (`companion_graph`).
-Kind = Literal["rays", "differentials", "hero", "companion"]
+Kind = Literal["rays", "few", "differentials", "hero", "companion"]
 # Takes film points, pupil squares [2, N] and wavelengths [1, N], by name, to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 
@@ -107,6 +108,11 @@ class LensCamera:
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Return rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
         return self._sampled(film_mm, pupil, wavelength_nm, False)
+
+    def sample_few(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Sample rays as `sample` does, to rounding, without compiling: a few thousand take less time so."""
+        film, square = self._checked(film_mm, pupil, wavelength_nm)
+        return camera_rays(self._run("few")({"film_mm": film, "square": square, "wavelength_nm": wavelength_nm[None]}))
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Sample rays as `sample` does, and give their differentials too."""
@@ -176,20 +182,25 @@ class LensCamera:
     def start(self, runtime: Runtime | None, progress: Progress | None = None) -> None:
         """Choose what runs the camera; None takes C where the machine has a compiler that takes it, else onnxruntime.
 
-        `progress` says where C is given up for onnxruntime.
+        C that is not asked for is compiled when rays are: many cameras are made for their pupil alone, and pictures
+        take other programs than single rays. `progress` says where C is given up for onnxruntime.
 
         Raises:
             InputError: C is asked for, and there is no compiler, or it fails.
         """
-        self.runtime, self._runs = runtime or ("c" if has_compiler() else "onnxruntime"), {}
-        self._asked, self._told = runtime is not None, (progress or Progress(quiet=True)).note
-        if self.runtime == "c":
+        self._runs, self._asked, self._told = {}, runtime is not None, (progress or Progress(quiet=True)).note
+        self._take(runtime or ("c" if has_compiler() else "onnxruntime"))
+        if runtime == "c":
             self._run("rays")
-        self.settings = self.settings | {"runtime": self.runtime}
+
+    def _take(self, runtime: Runtime) -> None:
+        self.runtime, self.settings = runtime, self.settings | {"runtime": runtime}
 
     def ready(self, wavelengths: int) -> None:
-        """Compile what `sample_spectrum` runs for so many wavelengths; each process opens onnxruntime for itself."""
-        if self.runtime == "c":
+        """Compile what rays of so many wavelengths take; each process opens onnxruntime for itself."""
+        if self.runtime == "c" and wavelengths == 1:
+            self._run("rays")
+        elif self.runtime == "c":
             self._run("hero", wavelengths - 1)
             self._run("companion")
 
@@ -253,7 +264,7 @@ class LensCamera:
         lens = self.lens_graph(SCALARS if self.runtime == "c" else ONNX)
         if kind == "differentials":
             lens = lens._replace(graph=self._with_moves(lens.graph))
-        mask_too = self.runtime != "c"
+        mask_too = self.runtime != "c" or kind == "few"
         if kind == "companion":
             assert self._shift is not None
             graph, numbers = companion_graph(lens, self._shift, mask_too), self._of_the_lens()
@@ -266,6 +277,10 @@ class LensCamera:
                 del graph.outputs["area_mm2"]
                 lanes = lanes_graph(self._shift, companions, self.film_mm, self.film.pose)
                 graph.outputs |= graph.inline(lanes, same)
+        if kind == "few":
+            mask = {} if lens.aperture is None or lens.aperture.mask is None else {"mask": lens.aperture.table}
+            call = {name: np.array([[value]], np.float32) for name, value in numbers.items()}
+            return lambda rays: evaluate(graph, rays | call | mask | {"outline": self.film.outline.table})
         if self.runtime == "c":
             try:
                 return _compiled(graph, numbers, self.film, lens)
@@ -273,7 +288,8 @@ class LensCamera:
                 if self._asked:
                     raise
                 self._told(f"{self.name} runs in onnxruntime: {error}")
-                self.runtime, self._runs = "onnxruntime", {}
+                self._runs.clear()
+                self._take("onnxruntime")
                 return self._made(kind, companions)
         return self._in_onnxruntime(graph, numbers, lens)
 

@@ -163,7 +163,7 @@ class LensFilm:
         pose: FilmPose = UPRIGHT,
     ) -> None:  # fmt: skip
         if outline is None:
-            raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
+            raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a wider stop or another focus")
         self.film_z_mm, self.scene, self.pose = scene.film_z_mm, scene, pose
         self.distance_mm = scene.film_z_mm - outline.pupil_z_mm
         if lean := pose.lean(film_mm, self.distance_mm):
@@ -232,7 +232,9 @@ class LensFilm:
         }
         exposure = float(evaluate(weight_graph(), given)["weight"].mean(dtype=np.float64))
         if not exposure > 0:
-            raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
+            raise InputError(
+                "camera", "f_number, focus_m", "(no ray passes on the axis)", "a wider stop or another focus"
+            )
         return exposure
 
 

@@ -56,6 +56,7 @@ from neurolens.optics.lens.shot import Dispersion, Vignetting
 Array = NDArray[np.float64]
 
 _FARTHEST_M = 1e4
+_FEW = 4096  # rays for which a compiler takes longer than they do
 _DEGREE, _ORDERS = 7, 3  # degrees of the shift's polynomial, in the film point and in the wavelength
 _POINTS, _SIDE, _WAVES = 192, 8, 7  # what the fit uses: film points, pupil samples a side, wavelengths
 _TINTS = 61  # wavelengths of the tint: 5 nm over 400-700 nm, as coated old glass falls steeply below 420 nm
@@ -86,10 +87,11 @@ def film_shift(
     count, pupils = square.shape[1:]
     focus = camera.settings.get("focus_m")
     reach = min(_FARTHEST_M if focus is None else float(focus), _FARTHEST_M)
+    sample = getattr(camera, "sample_few", camera.sample) if count * pupils <= _FEW else camera.sample
 
     def found(nm: float, at: Array) -> tuple[Array, NDArray[np.bool_]]:
         film = np.repeat(at, pupils, axis=1).astype(np.float32)
-        rays = camera.sample(film, square.reshape(2, -1).astype(np.float32), np.full(film.shape[1], nm, np.float32))
+        rays = sample(film, square.reshape(2, -1).astype(np.float32), np.full(film.shape[1], nm, np.float32))
         point = rays.origin_m.astype(np.float64) + rays.direction.astype(np.float64) * reach
         return point, (rays.status == 0) & np.isfinite(point).all(axis=0)
 

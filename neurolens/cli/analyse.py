@@ -16,7 +16,7 @@ import numpy as np
 
 from neurolens.base.errors import InputError, warned
 from neurolens.base.report import PART, Report
-from neurolens.base.settings import WAVELENGTH_NM, between, read_config, said, setting, wavelengths_nm, whole
+from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavelengths_nm, whole
 from neurolens.cli import arguments as cli
 from neurolens.optics.setting.copies import Tolerances
 
@@ -167,7 +167,7 @@ examples:
             dark = check_light(scene, self.field_points, (self.waves_nm or scene.waves_nm)[0])
             doubts += [d for d in dark if d not in doubts]
         elif what == "copies":
-            limits = Tolerances() if self.tolerances is None else read_config(Tolerances, self.tolerances)
+            limits = Tolerances.read(self.tolerances)
             options = {
                 "limits": limits,
                 "number": self.copies,

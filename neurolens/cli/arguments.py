@@ -236,9 +236,7 @@ class Command:
 
     def _size(self) -> dict[str, Any]:
         """Return what zooms or scales the lens."""
-        shot = self.state.shot() if hasattr(self, "state") else None
-        size = {name: getattr(shot, name, None) for name in ("zoom", "focal_length_mm", "field_deg")}
-        return {name: value for name, value in size.items() if value is not None}
+        return self.state.shot().size if hasattr(self, "state") else {}
 
     def _output(self, suffix: str | None = None) -> tuple[Path, str]:
         """Return a name in this folder: INPUT-LENS-COMMAND with a suffix, else that of the option's placeholder."""

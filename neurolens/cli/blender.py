@@ -27,6 +27,7 @@ from neurolens.base.lensname import is_model, lens_id_of, maker_of
 from neurolens.base.report import BULK, Report
 from neurolens.base.settings import RANGE, setting
 from neurolens.base.tasks import Failed, Here, Processes, run_each
+from neurolens.base.tomlfile import suggestion
 from neurolens.cameras.build import ideal_as, make_camera
 from neurolens.cameras.shaders.blender_shader import shader_of
 from neurolens.cli import arguments as cli
@@ -65,7 +66,7 @@ class Blender(cli.Command):
 class Build(cli.Reporting):
     """Pack the extension with a folder of models and with the lens files of the folder lenses/ beside it: of each
     lens the best polynomial, the best network and the exact lens, every surface traced.
-    What cannot be a shader is left out and said.
+    What cannot be a shader is left out, and named.
 
     Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
 
@@ -404,7 +405,8 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
         known |= {file.stem: {} for file in sorted(lenses.glob("*.toml")) if file.stem not in {*known, *modelled}}
     for name in chosen:
         if name not in known:
-            raise InputError("neurolens blender build", "--lens", name, f"one of: {', '.join(known)}")
+            near = suggestion(name, list(known))
+            raise InputError("neurolens blender build", "--lens", name, f"a lens of {folder} or {lenses}{near}")
     for key, kinds in known.items():
         if not chosen or key in chosen:
             lens_file = lenses / f"{key}.toml"

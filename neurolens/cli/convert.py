@@ -136,7 +136,7 @@ class Converted(Report):
             f"surfaces      {self.surfaces}, stop on {self.stop_surface}; rims: {self.rims}",
             f"focal length  {efl}{across}",
             f"back focus    {back}; film tabled at {gap}",
-            f"f-number      f/{cli.number(self.f_number)}, stated f/{cli.number(self.stated_f_number)}",
+            f"f-number      f/{cli.number(self.f_number)} by its stop, named f/{cli.number(self.stated_f_number)}",
             f"wavelength    {', '.join(cli.first_order_light(self.light))}",
             *([f"states        {', '.join(self.configurations)}"] if self.configurations else ()),
             *(f"warning: {text}" for text in self.warnings),
@@ -175,7 +175,6 @@ def _converted(lens: Lens, notes: list[str], file: Path, out: Path) -> Converted
     )
 
 
-_CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
 _NEAR_N_D, _NEAR_V_D = 0.01, 2.0  # a glass farther from a code than this has nothing to do with it
 _TRANSMITTED_NM = (400.0, 450.0, 550.0, 700.0)
 _PLATE_MM = 10.0
@@ -204,9 +203,8 @@ examples:
 
         glasses: list[catalogue.Glass] = []
         for name in self.name:
-            if _CODE.fullmatch(name):
-                digits = re.sub("[./]", "", name)
-                n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
+            if figures := catalogue.figures_of_code(re.sub("[./]", "", name)):
+                n_d, V_d = figures
                 first, *others = catalogue.by_code(name, 6)
                 found = [g for g in (first, *others) if abs(g.n_d - n_d) <= _NEAR_N_D and abs(g.V_d - V_d) <= _NEAR_V_D]
                 if not found:

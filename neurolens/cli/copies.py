@@ -6,7 +6,7 @@ from pathlib import Path
 
 from neurolens.base.lensname import is_model
 from neurolens.base.report import Report
-from neurolens.base.settings import group, read_config, setting, whole, with_changes
+from neurolens.base.settings import group, setting, whole, with_changes
 from neurolens.cli import arguments as cli
 from neurolens.cli.convert import write_checked
 from neurolens.optics.lens.prescription import Lens
@@ -35,7 +35,7 @@ examples:
     number: int = setting(10, "copies", kind=whole(1, 10_000), metavar="N", common=True)
     seed: int = setting(0, "seed of the random draws", kind=whole(0))
     tolerances: Path | None = setting(
-        None, "tolerances by the names of these options (decentre_mm = 0.02), instead of their defaults",
+        None, "tolerances by the names of these options, as decentre_mm = 0.02 (default: the word default, for theirs)",
         metavar="FILE.toml", common=True,
     )  # fmt: skip
     limits: Tolerances = group("tolerances", unset=True)
@@ -46,8 +46,7 @@ examples:
 
     def run(self) -> int:
         """Write the files and tell where they are."""
-        given = Tolerances() if self.tolerances is None else read_config(Tolerances, self.tolerances)
-        limits = with_changes(given, self.limits)
+        limits = with_changes(Tolerances.read(self.tolerances), self.limits)
         lens, written = self._models(limits) if is_model(self.file) else self._lenses(limits)
         self.out.mkdir(parents=True, exist_ok=True)
         files = [str(path) for path in written]

@@ -212,7 +212,7 @@ examples:
         progress = self.progress()
         camera, shot = self.make(self.state, progress, None)
         check_field(camera)
-        near_m = 20 * float(camera.settings["efl_mm"]) / 1000
+        near_m = float(f"{20 * float(camera.settings['efl_mm']) / 1000:.3g}")  # it stands in the file's name
         distances = self.distance or (near_m if math.isinf(shot.focus_m) else math.inf,)
         if not self.distance:
             note(f"assumed: --distance {distances[0]:g}")

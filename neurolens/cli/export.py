@@ -123,8 +123,8 @@ examples:
             write: Callable[[Path], Exported] = self._write_osl
         elif self.whole_camera or not is_model(file):
             if self.to == "onnx" or not whole:
-                what = "a camera" if self.whole_camera else "a lens file"
-                self.refuse(str(file), f"({what})", "source code (--to c, glsl ...), without --fix, --only")
+                what = "(a whole camera)" if self.whole_camera else "(a lens file)"
+                self.refuse(str(file), what, "a model, beside --to onnx, --fix or --only; or none of these")
             write = self._write_camera if self.whole_camera else self._write_lens
             size = {"--focal-length", "--field"} if self.state.given.zoom != RANGE else set()
             self._check_state(size | {"--zoom", "--coating"}, "focus and stop are arguments of the function")

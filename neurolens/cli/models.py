@@ -17,6 +17,7 @@ from neurolens.base.lensname import lens_id_of
 from neurolens.base.records import Timing, program, reaches, time_of
 from neurolens.base.report import OPTIONAL, PART, Report
 from neurolens.base.settings import setting, whole
+from neurolens.base.tomlfile import suggestion
 from neurolens.cli import arguments as cli
 from neurolens.studies.pages import CLOSE_UM, Advice, advice, expected_exact, to_use
 
@@ -56,9 +57,9 @@ examples:
         rows = [m for place in places for m in models_in(place)]
         of_lens = [m for m in rows if self.lens is None or m.is_of(self.lens)]
         if not of_lens:
-            known = ", ".join(sorted({m.lens for m in rows})) or "a model in one of these folders"
             looked = ", ".join(map(str, places)) or "models/, runs/*/models/"
-            self.refuse("LENS", self.lens or "(none)", f"one of: {known} (looked in {looked})")
+            near = suggestion(self.lens or "", sorted({m.lens for m in rows}))
+            self.refuse("LENS", self.lens or "(none)", f"a lens with a model in {looked}{near}")
         key, most = self.within or ("rms_um", CLOSE_UM)
         listed = sorted(of_lens, key=lambda m: (m.one_focus, m.lens, m.film_radius_mm, m.rms_um or 0.0))
         kept = [m for m in listed if self.within is None or reaches(vars(m), most, key)]

@@ -30,19 +30,18 @@ class Plan(cli.Figures):
     within a budget. The choice is among a pinhole, with or without its picture warped afterwards, a thin or thick lens,
     a model that ships, a polynomial fitted for this shot alone, and the exact lens. Needs the extra "train" (torch).
 
-    Errors are distances between the pictures of a point by a camera and by the exact lens, the least RMS way on which
-    light moves, and the relative error of light, of which 1% is allowed; 95% of the picture keep both. The price is the
-    time of the picture to equal noise, measured here on one thread. Cameras that take up to 1.2 times the least are
-    alike, and the exact lens is chosen where it is one of them. A plan that takes more than a tenth of its picture's
-    time says so first."""
+    The error of a point is the least RMS way that its light must move to become the exact lens's picture of it. Light
+    itself may be wrong by 1%. 95% of the picture keep both. The price is the time of the picture to equal noise,
+    measured here on one thread. Cameras within 1.2 times the least price count as equal, and the exact lens is chosen
+    where it is one of them. A plan that takes more than a tenth of its picture's time says so first."""
 
     epilog = """\
 examples:
   neurolens plan garden --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
 
--o leaves plan.json (all of it), effects.png (where in the picture the effects are that a camera needs), models/ with
-what was fitted, and plan.toml, which 'render' and 'export' take for the camera."""
+The folder holds plan.json (all figures), effects.png (where in the picture each effect is), models/ (what was
+fitted), and plan.toml, which 'render' and 'export' take for the camera."""
     kept = "models fitted so far are kept, the plan is not written"
 
     scene: Path = setting(
@@ -206,8 +205,8 @@ def _sentences(plan: plans.Plan) -> list[str]:
         nearest = min(plan.choices, key=lambda c: c.error_px, default=None)
         closest = f"; the closest is {nearest.name} with {cli.number(nearest.error_px, 3)} px" if nearest else ""
         return [f"No camera for --for {plan.target} keeps {plan.budget_px:g} px{closest}."]
-    how = f", {best.how}" * bool(best.how)
-    lines = [f"Use {best.short}{how}: {cli.number(best.error_px, 3)} px of {plan.budget_px:g}."]
+    how = f" ({best.how})" * bool(best.how)
+    lines = [f"Use {best.short}{how}. Its error is {cli.number(best.error_px, 3)} px of {plan.budget_px:g} allowed."]
     if plan.work.whole:
         noise = "the noise that the scene's samples have with the exact lens"
         lines.append(f"The picture takes about {seconds(best.seconds)} s of one thread to {noise}.")

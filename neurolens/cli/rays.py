@@ -22,7 +22,7 @@ from neurolens.cli.keys import ALL_KEYS, Frames, frames_group, numbered
 from neurolens.cli.stmap import PictureCommand
 from neurolens.pictures.render.film import PixelGrid, check_memory
 from neurolens.pictures.render.pictures import write_channels
-from neurolens.programs.hosts import BYTES_A_RAY, HOSTS, Arrays, Host, RayJob, RaySettings
+from neurolens.programs.hosts import BYTES_A_RAY, HOSTS, USUAL_PX, Arrays, Host, RayJob, RaySettings
 
 _MOST_LAYERS = 64  # samples that an EXR may have as layers
 
@@ -48,7 +48,7 @@ examples:
   neurolens rays models/NAME.onnx --width 1920 --film 36x24 --samples 4 --compact -o rays.safetensors
   neurolens rays laikin_double_gauss_50 --width 480 --film 36x24 --frames 1:48 --key focus=1:1.2,48:3 -o pull.npz"""
 
-    usual_px = 480
+    usual_px = USUAL_PX
     out: Path = cli.output_path("OUT.npz", "file to write: .npz, .safetensors or .exr")
     rays: RaySettings = group("rays")
     frames: Frames = frames_group("rays of these frames, OUT.0001.npz and so on", ALL_KEYS)

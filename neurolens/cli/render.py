@@ -115,8 +115,9 @@ examples:
     def run(self) -> int:
         """Render frames, or merge tiles; return the exit code of the first frame that fails."""
         if not self.merge and (len(self.scene) != 1 or self.camera is None):
-            missing = "SCENE" if len(self.scene) != 1 else "--camera"
-            self.refuse(missing, " ".join(map(str, self.scene)) or "(none)", "one of it")
+            scene, camera = " ".join(map(str, self.scene)) or "(missing)", self.camera or "(missing)"
+            missing, got = ("SCENE", scene) if len(self.scene) != 1 else ("--camera", camera)
+            self.refuse(missing, got, "one scene and one camera, as in: neurolens render lights --camera helios")
         try:
             return self._merge() if self.merge else self._run()
         except MemoryError as error:  # in one line

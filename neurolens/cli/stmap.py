@@ -451,8 +451,10 @@ examples:
   neurolens projection laikin_double_gauss_50 --width 1920 --film 36x20.25 --projection opencv -o gauss
   neurolens projection models/NAME.onnx --width 1920 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
-    projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] = setting(
-        "opencv", "the projection to fit (default: opencv)", old=("model",)
+    projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] | None = setting(
+        None,
+        "the projection to fit (default: opencv, or kannala-brandt beyond 85 degrees from the axis)",
+        old=("model",),
     )
     noncentral: bool = setting(
         False, "write the ray of each pixel, too, however little one centre leaves (default: above half a pixel)"
@@ -472,7 +474,7 @@ examples:
         near_m, spectrum = self.near_m(frame := frame_of(camera)), spectrum_of(camera, LIGHT_NM)
         with progress.stage(f"trace the field of {self.camera}"):
             field = field_of(camera, shot.focus_m, "equidistant", frame=frame, spectrum=spectrum)
-        with progress.stage(f"fit {self.projection}"):
+        with progress.stage("fit the projection"):
             fitted, left, told = handover.fitted_projection(
                 self.projection, field, self.picture, self.film, str(self.camera), complex(on_axis(camera)[0])
             )
@@ -495,7 +497,7 @@ examples:
             files = handover.write_projection(out, fitted, told) + files
         if not left.sound:
             turns = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
-            warn(f"{self.projection} {turns}")
+            warn(f"{fitted.kind} {turns}")
         return self.answer(Projected(told, files))
 
 

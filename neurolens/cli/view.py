@@ -195,7 +195,7 @@ def _view_lens(
         ghosts = ghosts_glsl(lens, image_radius_mm(lens)[0], _GHOSTS) if with_ghosts else None
     best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
     if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
-        raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of the lens file, in its state")
+        raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of this lens file, at one zoom")
     return ViewLens(
         entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
         min(float(f.card["film_radius_mm"]) for f in forms), squeeze, best.card["f_numbers"],

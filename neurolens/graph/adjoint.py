@@ -76,7 +76,7 @@ class _Values:
                 self.again[argument] = self.program.kept(argument, self.now)
             else:
                 given = tuple(self(a).argument for a in step.arguments)
-                self.again[argument] = self.program._append(replace(step, arguments=given))
+                self.again[argument] = self.program._append(step._replace(arguments=given))
         return self.again[argument]
 
 
@@ -176,7 +176,7 @@ def _prepared(program: Program, inputs: Collection[str]) -> tuple[Program, dict[
                 if known is None or known[0] != t:
                     continue
                 slope = inner.program.fma(Expr(inner.program, known[1]), given[of], inner)
-            value = inner.program._append(replace(step, arguments=tuple(e.argument for e in given)))
+            value = inner.program._append(step._replace(arguments=tuple(e.argument for e in given)))
             if isinstance(value.argument, int):
                 slopes[value.argument] = t, slope.argument
             return value

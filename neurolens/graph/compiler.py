@@ -26,7 +26,7 @@ from neurolens.base.progress import duration
 FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-inline")
 _SECONDS = 300  # the largest models known compile in ten
 _ROOM = 2**20
-_KEPT = 64  # libraries of 50 to 200 kB
+_KEPT = 256  # libraries of 30 to 200 kB, up to four of a camera; as many as outlines are kept
 _TAKEN_S: list[float] = []  # by each compilation of this process, see `compiled_so_far`
 _ONE_AT_A_TIME = threading.RLock()  # threads that need the same library do not both compile it
 if hasattr(os, "register_at_fork"):  # not under Windows

@@ -366,9 +366,9 @@ def live_rows(graph: Graph, outputs: Mapping[str, Value]) -> dict[int, set[int]]
     """Return the rows of each node that the outputs need; nodes that are not needed are missing."""
     needed: dict[int, set[int]] = {}
 
-    def ask(number: int, rows: Iterable[int]) -> None:
-        available = graph.nodes[number].rows
-        needed.setdefault(number, set()).update(r if available > 1 else 0 for r in rows)
+    def ask(number: int, rows: Collection[int]) -> None:
+        if rows:  # a single row stands for any
+            needed.setdefault(number, set()).update(rows if graph.nodes[number].rows > 1 else (0,))
 
     for value in outputs.values():
         ask(value.number, range(value.rows))

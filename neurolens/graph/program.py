@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,8 +68,7 @@ def row_names(name: str, rows: int) -> tuple[str, ...]:
     return (name,) if rows == 1 else tuple(f"{name}_{k}" for k in range(rows))
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One assignment: an operation of `KINDS`, or "input".
 
     Attributes:
@@ -297,11 +296,16 @@ class Program:
 
     def live(self) -> list[int]:
         """Return the numbers of the steps that any output needs, in order."""
-        wanted = {e.argument for e in self.outputs.values() if isinstance(e.argument, int)}
+        wanted = bytearray(len(self.steps))
+        for e in self.outputs.values():
+            if isinstance(e.argument, int):
+                wanted[e.argument] = True
         for k in range(len(self.steps) - 1, -1, -1):
-            if k in wanted:
-                wanted.update(a for a in self.steps[k].arguments if isinstance(a, int))
-        return sorted(wanted)
+            if wanted[k]:
+                for a in self.steps[k].arguments:
+                    if isinstance(a, int):
+                        wanted[a] = True
+        return [k for k, is_wanted in enumerate(wanted) if is_wanted]
 
     def in_order_of_need(self) -> Program:
         """Return the same program with every product right before the first sum that uses it, so that few values wait.
@@ -422,7 +426,7 @@ class Program:
         for k in order or self.live():
             step, given = self.steps[k], [moved(a) for a in self.steps[k].arguments]
             other = rule(k, step, given) if rule else None
-            place[k] = other or found._append(replace(step, arguments=tuple(e.argument for e in given)))
+            place[k] = other or found._append(step._replace(arguments=tuple([e.argument for e in given])))
         found.outputs = {name: moved(e.argument) for name, e in self.outputs.items()}
         for k, a in self.tanh_of.items():
             value, of = (place[n].argument if n in place else None for n in (k, a))

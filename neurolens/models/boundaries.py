@@ -112,7 +112,9 @@ def solve_scalars(data: Prepared, features: Features, kept: Sequence[list[int]] 
     pairs = data.pairs
     train, near, far = (features(data.encoding(rays.inputs)) for rays in (pairs.train, data.boundary, pairs.far))
     if len(data.boundary) <= len(train):
-        raise InputError("fit", "rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms")
+        raise InputError(
+            "settings", "pairs.rim", len(data.boundary), f"more rays near the rims than the {len(train)} terms"
+        )
     fit = GateFit(near, gate_values(pairs.lens, data.gates, data.boundary), data.boundary_weights[0], kept)
     fit.block(far, gate_values(pairs.lens, data.gates, pairs.far), gate_reach(data.gates, pairs.far))
     return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])

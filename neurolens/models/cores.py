@@ -391,29 +391,25 @@ class Network(Core):
         """Return the number of outputs before the scalars."""
         return 12 if self.mirror else 6
 
-    def hidden_units(self, field: Field) -> Value:
-        """Return the values of the units of the last tanh layer, which the output takes."""
-        g, h = field.planes.graph, field.products(MIRROR if self.mirror else ROUND)
+    def rows(self, g: Graph, field: Field, units: Units, added: Value | None = None) -> Value:
+        """Return the rows of A for the three vectors, then of B, then the scalars.
+
+        The rows of `added`, in the same order, are added to them.
+        """
+        h = field.products(MIRROR if self.mirror else ROUND)
         for k, (weight, bias) in enumerate(self.hidden):
             if k == 0:  # shift and scale are folded into it; without dispersion the last invariant is 0
                 weight = weight * self.scale
                 bias = bias - (weight * self.shift).sum(1)
                 weight = weight[:, : h.rows]
             h = g.affine(weight, h, bias).tanh()
-        return h
-
-    def rows(self, g: Graph, field: Field, units: Units, added: Value | None = None) -> Value:
-        """Return the rows of A for the three vectors, then of B, then the scalars.
-
-        The rows of `added`, in the same order, are added to them.
-        """
         weight, bias = self.output
         n, axes = self.ab_rows, self.ab_rows // 6
         order = [*range(0, n, 2), *range(1, n, 2), *range(n, len(weight))]  # A of the three vectors, then B
         vectors = np.repeat(units.vectors, axes)
         factors = np.concatenate([vectors, vectors, units.scalars(len(weight) - n)])
         weight, bias = factors[:, None] * weight[order], factors * bias[order]
-        return g.affine(weight, self.hidden_units(field), bias, added=added)
+        return g.affine(weight, h, bias, added=added)
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         return symmetric(self.rows(g, field, units), field, len(self.output[1]) - self.ab_rows)
@@ -502,14 +498,13 @@ class Refracted(Composite):
 @stored_as("phased")
 @dataclass(frozen=True, eq=False)
 class Phased(Composite):
-    """A core with a polynomial beside it, or this and a network, that give the optical path of `models.phase`.
+    """A core with a polynomial beside it that gives the optical path of `models.phase`.
 
     Attributes:
         parts: the one core, whose rays stay as they are.
         exponents: [M, 4] int64 of rho, sigma, tau, w. path: [M] coefficients in um.
         focal_z_mm, front_z_mm: of the plane on which the path begins, and of the point about which it ends.
         direction: coefficients of the direction s(P) in which a wave leaves; see `models.phase.Waves`.
-        rest: a network of one output, which is added to the path; None where the polynomial suffices.
     """
 
     parts: tuple[Any]
@@ -518,22 +513,17 @@ class Phased(Composite):
     focal_z_mm: float
     front_z_mm: float
     direction: tuple[float, ...]
-    rest: Network | None = None
 
     def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
         x, used = field.products(ROUND), self.exponents[:, -1] == 0
         used = used | field.dispersive
         path = g.polynomial(self.exponents[used][:, : x.rows], self.path[None, used], x)
-        if self.rest is not None:
-            weight, bias = self.rest.output
-            path = path + g.affine(weight, self.rest.hidden_units(field), bias)
         return replace(self.parts[0].build(g, field, units), path_um=path)
 
     def fixed(self, w: float) -> Self:
         unique, merge = without_w(self.exponents, w)
-        rest = self.rest and self.rest.fixed(w)
-        return replace(super().fixed(w), exponents=unique, path=self.path @ merge, rest=rest)
+        return replace(super().fixed(w), exponents=unique, path=self.path @ merge)
 
     @property
     def coefficients(self) -> int:
-        return super().coefficients + len(self.path) + (self.rest.coefficients if self.rest else 0)
+        return super().coefficients + len(self.path)

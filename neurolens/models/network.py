@@ -89,7 +89,7 @@ def fit_network(
         OSError: the checkpoint cannot be written.
     """
     if not len(data.pairs.train):
-        raise InputError("mlp", "pairs.train", "(no rays)", "at least one passing ray")
+        raise InputError("settings", "pairs.train", "(no rays)", "at least one passing ray")
     with pinned_threads():
         problem, shift, scale = _problem(data, base)
         decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seed")}
@@ -138,16 +138,10 @@ def _problem(data: Prepared, base: InvariantPolynomial | None) -> tuple[Problem,
     boundary = boundary.select(slice(0, _RAYS - len(train)))
     parts = [_part(data, s, base) for s in (train, boundary) if len(s)]
     inputs, *rest = (torch.cat(c, -1) for c in zip(*parts, strict=True))
-    inputs, shift, scale = scaled(inputs)
-    return Problem(inputs, *rest), shift, scale
-
-
-def scaled(invariants: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what a network sees [N, 4] of invariants [4, N], all from -1 to 1, with their shift and scale [4]."""
-    low, high = invariants.amin(1), invariants.amax(1)
+    low, high = inputs.amin(1), inputs.amax(1)
     shift = (low + high) / 2
     scale = torch.where(high > low, 2 / torch.where(high > low, high - low, 1.0), 1.0)
-    return ((invariants - shift[:, None]) * scale[:, None]).T.contiguous(), shift, scale
+    return Problem(((inputs - shift[:, None]) * scale[:, None]).T.contiguous(), *rest), shift, scale
 
 
 def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> tuple[Tensor, ...]:

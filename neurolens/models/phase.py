@@ -28,11 +28,9 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.models.cores import Array, Network, Phased, angle_vector
+from neurolens.models.cores import Array, Phased, angle_vector
 from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
-from neurolens.models.network import random_layers, scaled
-from neurolens.models.projection import OptimiserState, Problem, activations, minimise
 from neurolens.models.targets import STOPPED_DOWN
 from neurolens.models.terms import (
     Exponents,
@@ -52,20 +50,15 @@ from neurolens.optics.setting.pupils import camera_rays, on_plane
 from neurolens.optics.trace.rays import optical_path, trace
 from neurolens.optics.trace.surfaces import Rays
 
-TERMS, FINE_WAVES = 120, 0.0015  # at most, and the RMS at which no term is added
-# Where all terms leave more than the first RMS, and less than the second, a network of two layers stands beside them.
-# One is fitted to what this share of the terms leaves, which is smoother than what all leave, and another one to that:
-# which of them learns more differs from lens to lens. Each trains for a minute on one core. The one that helps the rays
-# that it has not seen most is kept, and none if none does.
-ENOUGH_WAVES, _MOST_WAVES = 0.01, 1.0
-_UNITS, _STEPS, _SMOOTH, _SEEN = 24, 160, 5 / 12, (7, 8)
-# Where they leave more, rays count by their blur on the film, half at this: where there is no image, a small share of
-# a large error is as large as all of it in the image.
-_SHARP_UM = 100.0
+# At most so many terms, the RMS at which no term is added, and the RMS above which there may be more terms.
+TERMS, FINE_WAVES, ENOUGH_WAVES, MORE_TERMS = 120, 0.0015, 0.005, 240
+# Where they leave more than this, rays count by their blur on the film, half at the second: where there is no image, a
+# small share of a large error is as large as all of it in the image.
+_MOST_WAVES, _SHARP_UM = 1.0, 100.0
 # Candidates: largest degrees for the powers of w, and of all, those with (i + 1) (j + 1) (k + 1) up to the last number.
 # Over 380 to 780 nm the path bends by w^4 and w^5 more than by any high degree of the rays: with w^3 at most, 120 terms
 # left 0.85 waves of a fisheye in place of 0.006.
-_DEGREES, _CROSS = (14, 10, 8, 7, 6, 5, 4), 36
+_DEGREES, _CROSS = (16, 12, 10, 8, 7, 6, 5), 64
 _SURPLUS, _PASSES = 1.5, 3  # terms before elimination over terms kept; of replacement
 _CHOICE_RAYS, _RAYS = 8000, 16_000
 _DIRECTION = 4  # coefficients of s(P): more make the path less smooth
@@ -82,8 +75,11 @@ class Waves(NamedTuple):
     length: Array
 
 
-def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
+def with_phase(model: LensModel, rays: FilmRays, most: int = MORE_TERMS) -> LensModel:
     """Return the model with the optical path as one more output, fitted to rays that its lens passes.
+
+    The path has at most `TERMS` terms, or `most` where these leave more than `ENOUGH_WAVES` and less than one wave. A
+    network beside 120 terms, of 745 weights and a minute of training, left two to three times what 240 terms leave.
 
     Raises:
         InputError: a lens with cylinders or ideal surfaces, or a first-order model.
@@ -93,25 +89,19 @@ def with_phase(model: LensModel, rays: FilmRays) -> LensModel:
     if model.encoding.mirror or model.direction == "slope":
         found = "(cylinders)" if model.encoding.mirror else f"(with method {model.method})"
         raise InputError(lens.path, "phase", found, "a round lens, and a fit of its rays")
-    first, unit, rest = first_order(lens), unit_um(lens), None
+    first, unit = first_order(lens), unit_um(lens)
     front = float(first.front_principal_z_mm - first.front_efl_mm)
     empty = np.zeros((0, 4), np.int64), np.zeros(0)
     core, rays = Phased((model.core,), *empty, float(first.rear_focal_z_mm), front, ()), rays.select(slice(0, _RAYS))
     with pinned_threads():
         core = replace(core, direction=_mean_direction(traced(lens, core, model.domain.pupil_z_mm, rays)))
-        variables, wanted, weights = fit = _known(model, core, rays)
-        exponents, path, left = _polynomial(model, fit, TERMS)
-        off = float((left * weights).norm() / weights.norm()) / unit
-        if off >= _MOST_WAVES:
+        fit = _known(model, core, rays)
+        exponents, path, off = _polynomial(model, fit, TERMS)
+        if off >= _MOST_WAVES * unit:
             exponents, path, _ = _polynomial(model, _known(model, core, _towards_axis(model, rays), _SHARP_UM), TERMS)
-        elif off > ENOUGH_WAVES:
-            seen, all_leave = len(rays) * _SEEN[0] // _SEEN[1], left
-            for given in (_polynomial(model, fit, int(_SMOOTH * TERMS))[2], all_leave):
-                network, taken = _network(variables, given, weights, unit, seen)
-                beside = _polynomial(model, (variables, wanted - taken, weights), TERMS)
-                if float((beside[2] * weights)[:, seen:].norm()) < float((left * weights)[:, seen:].norm()):
-                    (exponents, path, left), rest = beside, network
-    return replace(model, core=replace(core, exponents=exponents, path=path, rest=rest))
+        elif off > ENOUGH_WAVES * unit:
+            exponents, path, _ = _polynomial(model, fit, most)
+    return replace(model, core=replace(core, exponents=exponents, path=path))
 
 
 def _known(model: LensModel, core: Phased, rays: FilmRays, sharp_um: float = math.inf) -> tuple[Tensor, Tensor, Tensor]:
@@ -143,14 +133,15 @@ def _towards_axis(model: LensModel, rays: FilmRays) -> FilmRays:
     return moved.select(trace(model.lens, toward, moved.wavelength_nm).status == st.PASSED)
 
 
-def _polynomial(model: LensModel, fit: tuple[Tensor, Tensor, Tensor], terms: int) -> tuple[Exponents, Array, Tensor]:
-    """Return the exponents and coefficients of the best terms, at most so many, and what they leave [1, N]."""
+def _polynomial(model: LensModel, fit: tuple[Tensor, Tensor, Tensor], terms: int) -> tuple[Exponents, Array, float]:
+    """Return the exponents and coefficients of the best terms, at most so many, and the RMS that they leave, in um."""
     variables, wanted, weights = fit
     allowed = FINE_WAVES * unit_um(model.lens)
     exponents = _chosen(variables, wanted, weights, allowed, terms, dispersive=model.encoding.dispersive)
     columns = monomials(variables, exponents)
     path = solve(columns, wanted, weights)
-    return exponents, path[0].numpy(), wanted - path @ columns
+    off = float(((wanted - path @ columns) * weights).norm() / weights.norm())
+    return exponents, path[0].numpy(), off
 
 
 def unit_um(lens: Lens) -> float:
@@ -241,21 +232,6 @@ def _chosen(
     return candidates[sorted(sweep.chosen)]
 
 
-def _network(variables: Tensor, left: Tensor, weights: Tensor, unit: float, seen: int) -> tuple[Network, Tensor]:
-    """Fit a network to what a polynomial leaves of the first rays [1, N], and return what it takes of that of all.
-
-    `unit`: of its output, in um. `seen`: how many rays it is fitted to.
-    """
-    inputs, shift, scale = scaled(variables)
-    vectors = left.new_zeros((1, 2, seen))
-    given = left[:, :seen] / unit, weights[None, :seen]
-    problem = Problem(inputs[:seen], vectors, vectors, vectors[:0], vectors[:0, 0], *given)
-    best, _ = minimise(problem, OptimiserState(random_layers(inputs, _UNITS, 2, 0)), _STEPS)
-    *hidden, (weight, bias) = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
-    found = Network(tuple(hidden), (unit * weight, unit * bias), shift.numpy(), scale.numpy())
-    return found, unit * best.output @ activations(best.hidden, inputs)[-1].T
-
-
 def path_errors(model: LensModel, rays: FilmRays) -> dict[str, float]:
     """Return the errors of the path, in float32, on rays that the lens passes; {} without a path.
 
@@ -314,6 +290,6 @@ def card_entry(core: Any) -> Mapping[str, Any]:
         return {}
     return {"phase": {
         "about": __doc__.split("\n\n", 1)[1].strip(), "terms": len(core.path),
-        "network_weights": core.rest.coefficients if core.rest else 0, "focal_z_mm": core.focal_z_mm,
+        "focal_z_mm": core.focal_z_mm,
         "front_z_mm": core.front_z_mm, "direction_rad_per_mm": list(core.direction),
     }}  # fmt: skip

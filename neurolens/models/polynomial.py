@@ -88,10 +88,10 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     if settings.method not in POLYNOMIALS:
         raise InputError("fit", "method", settings.method, f"one of {', '.join(POLYNOMIALS)}")
     if settings.terms < 2:
-        raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
+        raise InputError("settings", "model.terms", settings.terms, "at least 2 coefficients per vector output")
     count = len(data.pairs.train)
     if count <= settings.terms:
-        raise InputError("fit", "train", count, f"more training rays than the {settings.terms} terms")
+        raise InputError("settings", "pairs.train", count, f"more training rays than the {settings.terms} terms")
     train, dispersive = data.train, data.encoding.dispersive
     outputs = weighed_apart(data.pairs.lens, data.pairs.domain, train.vectors, settings.position_weight)
     # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
@@ -324,10 +324,10 @@ def fit_mirror(data: Prepared, method: str, terms: int, degree: int) -> MirrorPo
             "fit", "method", method, f"{', '.join(_MIRROR_METHODS)} or mlp, the fits of lenses with cylinders"
         )
     if terms < 4:
-        raise InputError("fit", "terms", terms, "at least 4 coefficients per vector output")
+        raise InputError("settings", "model.terms", terms, "at least 4 coefficients per vector output")
     pairs, train = data.pairs, data.train
     if len(pairs.train) <= terms:
-        raise InputError("fit", "train", len(pairs.train), f"more training rays than the {terms} terms")
+        raise InputError("settings", "pairs.train", len(pairs.train), f"more training rays than the {terms} terms")
     dispersive = data.encoding.dispersive
     outputs = film_equivalent(pairs.lens, pairs.domain, train.vectors)
     field = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field))

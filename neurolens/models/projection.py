@@ -31,7 +31,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Problem:
-    """A weighted fit of vectors A p + B u, of which there may be none, and of scalars.
+    """A weighted fit of vectors A p + B u and of scalars.
 
     Attributes:
         inputs: [N, I] what the network sees.
@@ -87,14 +87,14 @@ class Problem:
     @cached_property
     def ridge(self) -> Tensor:
         """Return the penalty [V + S] on the squared last-layer weights of each vector and scalar."""
-        vectors = self.curvature[:, : 3 * len(self.vectors)].sum(0).reshape(len(self.vectors), 3)[:, ::2].mean(1)
+        vectors = self.curvature[:, : 3 * len(self.vectors)].sum(0).reshape(-1, 3)[:, ::2].mean(1)
         # The tiny constant keeps an output that no ray weighs solvable (as zero).
         return _RIDGE * torch.cat([vectors, self.curvature[:, 3 * len(self.vectors) :].sum(0)]) + 1e-30
 
     def loss(self, outputs: Tensor) -> float:
         """Return the mean weighted squared residual of outputs [N, rows]."""
         n = 2 * len(self.vectors)
-        ab = outputs[:, :n].T.reshape(len(self.vectors), 2, 1, len(self))
+        ab = outputs[:, :n].T.reshape(-1, 2, 1, len(self))
         error = (ab[:, 0] * self.p + ab[:, 1] * self.u - self.vectors) * self.vector_weights[:, None]
         scalar = (outputs[:, n:].T - self.scalars) * self.scalar_weights
         return float((error**2).sum() + (scalar**2).sum()) / len(self)
@@ -155,7 +155,7 @@ def project(problem: Problem, hidden: list[Tensor]) -> Projection:
         output[rows] = torch.cholesky_solve(moments[rows].reshape(-1, 1), factors[-1]).reshape(-1, width)
     outputs = torch.cat(features) @ output.T
     sizes = (output**2).sum(1)
-    grouped = torch.cat([sizes[: 2 * vectors].reshape(vectors, 2).sum(1), sizes[2 * vectors :]])
+    grouped = torch.cat([sizes[: 2 * vectors].reshape(-1, 2).sum(1), sizes[2 * vectors :]])
     loss = problem.loss(outputs) + float((problem.ridge * grouped).sum()) / len(problem)
     return Projection(hidden, output, factors, outputs, loss)
 

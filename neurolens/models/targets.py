@@ -204,7 +204,7 @@ class ModelSettings:
     growth: int = setting(2, "rounds in which ols adds products of the chosen terms to the candidates", within=(0, 16))
     position_weight: float = setting(2.0, "weight of the position in the choice of terms, relative to first order")
     transmittance_terms: int = setting(TRANSMITTANCE_TERMS, "most terms of the transmittance", within=(1, 200))
-    phase: bool = setting(False, "whether the optical path is one more output, of up to 120 terms of its own")
+    phase: bool = setting(False, "whether the optical path is one more output, of up to 240 terms of its own")
     idle_gates: float = setting(0.0, "rims that alone block at most this share of the domain's rays are left out")
     planes: bool = setting(True, "whether methods of `PLANES_SEARCHED` search the planes of the light field")
     units: int = setting(16, "units of each layer of a network", within=(1, 512))
@@ -419,8 +419,8 @@ def prepare(pairs: RayPairs) -> Prepared:
     lost = float(untold.double().sum()) / len(drawn)
     if lost > 1e-4:
         warnings.warn(
-            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total "
-            "reflection in a way that no gate shows; the rims near by stand in for that boundary",
+            f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays miss a surface or are totally "
+            "reflected where no gate of the model says so; there the model blocks by the nearest rims",
             NeurolensWarning,
             stacklevel=2,
         )

@@ -395,9 +395,10 @@ class FittedProjection:
 
 
 def fitted_projection(
-    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str, axis_mm: complex = 0j
-) -> tuple[projections.Projection, projections.Residual, FittedProjection]:
-    """Fit a projection to a field; return the projection, what it leaves, and both as figures.
+    kind: str | None, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str,
+    axis_mm: complex = 0j,
+) -> tuple[projections.Projection, projections.Residual, FittedProjection]:  # fmt: skip
+    """Fit a projection, of a `kind` as in `projections.fit`, to a field; return it, what it leaves, both as figures.
 
     `axis_mm`: the picture point on the axis.
 

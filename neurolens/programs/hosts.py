@@ -36,7 +36,7 @@ from neurolens.base.settings import (
     whole,
     within,
 )
-from neurolens.cameras.build import make_camera
+from neurolens.cameras.build import film_of, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.field import frame_of
 from neurolens.cameras.sampling import focus_m
@@ -50,6 +50,7 @@ from neurolens.pictures.render.settings import size_by_shape
 
 Arrays = dict[str, NDArray[Any]]
 Vector = tuple[float, float, float]
+USUAL_PX = 480  # width of a picture
 BYTES_A_RAY = 44  # the most, with three weights
 MOST_COMPACT_PX = 0.01  # how far rays in 16 bytes may be off
 _PROBES, _FLATTEST = 4096, 0.17  # rays that measure this; their least cosine to the axis, that of 80 degrees
@@ -188,15 +189,16 @@ def _numbers(values: Any) -> tuple[float, ...]:
 
 
 def rays(
-    camera: str | os.PathLike[str], film: tuple[float, float], *, width: int | None = None, height: int | None = None,
-    device: Any = None, **settings: Any,
+    camera: str | os.PathLike[str], film: tuple[float, float] | None = None, *, width: int | None = None,
+    height: int | None = None, device: Any = None, **settings: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the rays of a picture through a lens, as `neurolens rays` writes them.
 
     Args:
         camera: a lens file, a model, the name of one, or another camera (`cameras.build.make_camera`). A lens or camera
             that is set, which `neurolens.rays` takes, too, brings its settings; those of the call win.
-        film: its width and height in mm. width, height: of the picture in pixels, one or both.
+        film: its width and height in mm; None takes the format that the lens covers.
+        width, height: of the picture in pixels, one or both; without either the width is 480.
         device: of torch; None gives arrays of numpy.
         settings: fields of `RaySettings`, and of `Shot` (f_number, zoom, ...; focus_m is infinity unless given).
 
@@ -219,12 +221,13 @@ def rays(
     for name in settings.keys() - own - of_shot:
         raise InputError("rays", name, settings[name], f"one of: {', '.join(sorted(own | of_shot))}")
     asked = RaySettings(**{name: settings.pop(name) for name in own & settings.keys()})
-    if width is None and height is None:
-        raise InputError("rays", "width", None, "width or height of the picture in pixels")
+    width = USUAL_PX if width is None and height is None else width
     width, height = (
         None if pixels is None else _whole(name, pixels, 1) for name, pixels in (("width", width), ("height", height))
     )
     try:
+        if film is None:
+            film, _ = film_of(os.fspath(camera), **Shot.part(**settings).size)
         film = check_film(film)
     except (TypeError, InputError):
         raise InputError("rays", "film", film, f"a width and a height, each {said(FILM_MM)} mm") from None

@@ -323,14 +323,16 @@ def library_row(path: Path, checked: bool = True, characters: bool = False) -> d
     return {"lens": path.stem, "file": str(path), **row, "notes": notes}
 
 
-_STATED = ("name", "believed_to_be", "stated_efl_mm", "half_field_deg", "image_radius_mm", "refractions", "rims")
+_STATED = (
+    "name", "believed_to_be", "mount", "stated_efl_mm", "half_field_deg", "image_radius_mm", "refractions", "rims",
+)  # fmt: skip
 
 
 def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
     """Return a lens, as read from its file, as a row of a table, with its `check_lens` or (None) without.
 
     Returns:
-        name, believed_to_be, maker, year, efl_mm and efl_x_mm computed (the latter only for an anamorphic lens),
+        name, believed_to_be, mount, maker, year, efl_mm and efl_x_mm computed (the latter only for an anamorphic lens),
         stated_efl_mm, back_focus_mm, f_number of the stop, half_field_deg as stated, image_radius_mm as stated,
         refractions, aspheres, cylinders, states (zoom or focus), match (how surely photographs are of this product),
         rims, verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of {state, quantity,

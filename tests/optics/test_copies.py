@@ -86,6 +86,7 @@ def test_the_command_writes_files_that_read_back(
     limits = Tolerances(decentre_mm=0.1, gap_mm=0.01)
     for path, copy in zip(data["files"], copies_of(lens, limits, 2, 4), strict=True):
         assert read_lens(path).surfaces == copy.surfaces
+    assert Tolerances.read(Path("default")) == Tolerances()
     table.write_text("decentre_mm = -1\n")
     assert main([*words, "-o", str(tmp_path / "made")]) == 2
     assert "limits.toml: decentre_mm: got -1" in capsys.readouterr().err

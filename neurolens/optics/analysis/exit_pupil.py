@@ -61,7 +61,7 @@ class ExitPupil:
         figures: [D, D, K] Chebyshev coefficients on that box: of the wavefront W in mm, of the light per area of
             cosines in mm^2 (for an irradiance of 1 at the lens), and of x, y in mm at each surface that may cut the
             beam.
-        limits_mm: radii of those surfaces; the stop is the first.
+        limits_mm: radii of those surfaces; the stop is the first. Traced pupils have `_told` as the last.
         aperture: the stop's shape.
         hits_mm: [2, N] where some of the rays meet the film, counted from the centre.
         box: the part of the disc across the light's direction that holds the rays, [2 (low, high), 2].
@@ -274,14 +274,32 @@ def fitted_pupil(
     centre = rays.hits[:, through].mean(1)
     every = range(len(limits))
     cut = [rays.stop, *(k for k in every if k != rays.stop and part[k, near].max() > 1)]
-    design = _design(np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None]).tobytes())
+    known = np.ascontiguousarray((cosines[:, near] - middle[:, None]) / half[:, None])
+    design = _design(known.tobytes())
     along = np.concatenate([by / side for by, side in zip(design.slopes, half, strict=True)])
     wave = _least(along[:, 1:])(-(rays.hits[:, near] - centre[:, None]).reshape(-1))
     at, power = rays.at[cut][..., near].reshape(2 * len(cut), -1), (rays.power * energy)[near]
     figures = _fitted(design, half, np.array([0 * power, power, *places[:, near], *at])[:, None])[0]
     figures[_I, _J, 0] = [0, *wave]
+    figures = np.concatenate([figures, _told(known)], -1)
     hits, box = rays.hits[:, through] - centre[:, None], np.zeros((2, 2)) if box is None else box
-    return ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), aperture, hits, box)
+    return ExitPupil(wavelength_nm, centre, middle, half, figures, (*limits[cut], 1.0), aperture, hits, box)
+
+
+def _told(points: Array) -> Array:
+    """Return the series [D, D, 2] of x and y that keep within 1 in an ellipse about points [2, N] of the box.
+
+    It is a rim of the pupil: beyond the rays that they were fitted to polynomials swing, and may let light pass.
+    """
+    share, found = np.full(points.shape[1], 1 / points.shape[1]), np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
+    for _ in range(20):  # Titterington's way to the smallest ellipse: points far out come to weigh more
+        middle = points @ share[:, None]
+        round_ = np.linalg.inv(np.linalg.cholesky((points - middle) * share @ (points - middle).T))
+        apart = ((round_ @ (points - middle)) ** 2).sum(0)
+        share = share * (apart + 1) / 3
+    round_ /= math.sqrt(apart.max())
+    found[[0, 1, 0], [0, 0, 1]] = np.column_stack([-round_ @ middle, round_]).T
+    return found
 
 
 def fitted_waves(

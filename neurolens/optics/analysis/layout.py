@@ -164,7 +164,7 @@ def _fan_lines(scene: Scene, field: float) -> list[Array]:
 def lens_layout(layout: Layout, path: str | Path) -> None:
     """Draw a lens with rays, light from left to right, as PNG, PDF or SVG."""
     z, top = _limits(layout)
-    height_in = min(9.0, max(3.9, 8.6 * 2 * top / (z[1] - z[0]) + 2.1))
+    height_in = min(9.0, max(3.5, 8.6 * 2 * top / (z[1] - z[0]) + 1.7))
     with drawing(path, 9.4, height_in, layout.title, layout.subtitle) as figure:
         axes = figure.add_subplot()
         axes.set(xlabel="z (mm), light travels this way →", ylabel=f"{layout.height} (mm)")

@@ -190,7 +190,7 @@ class Residual:
 
 
 def fit(
-    kind: str,
+    kind: str | None,
     direction: Array,
     pixel: Array,
     size: tuple[int, int],
@@ -202,6 +202,7 @@ def fit(
     """Fit a projection with the least mean squared distance from pixels, weighted by their light.
 
     Args:
+        kind: None takes OpenCV's planar one, or its fisheye where the field is too wide for a plane.
         direction: [N, 3] unit vectors. pixel: [N, 2] where a lens shows them; both spread evenly over the picture.
         size: of the picture. focal_px: paraxial fx and fy; where they are equal, they stay equal.
         source: what errors name.
@@ -213,6 +214,7 @@ def fit(
         InputError: the field is too wide for this kind, or there are fewer points than numbers.
     """
     widest = float(_angle(direction).max(initial=0))
+    kind = kind or ("opencv" if math.degrees(widest) <= WIDEST_DEG else "kannala-brandt")
     if kind in PLANAR and math.degrees(widest) > WIDEST_DEG:
         expected = f"a field up to {WIDEST_DEG:g} degrees from the axis: --projection kannala-brandt or f-theta"
         raise InputError(source, f"--projection {kind}", f"({math.degrees(widest):.4g} degrees)", expected)

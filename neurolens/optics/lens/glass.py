@@ -149,11 +149,13 @@ def _root(square: Any) -> Any:
 MAKERS = ("Schott", "Ohara", "Hoya", "Hikari", "CDGM", "Sumita", "LZOS", "generic")
 
 _BY_LETTERS = {maker.upper(): maker for maker in MAKERS}
+_LEAST_INDEX = 1.3  # of a glass
 _LONGEST = 100  # Only so many characters of a name count.
 
 # Other names of the same dispersion: Schott publishes one set of coefficients for BK7 and N-BK7.
 ALIASES = {
     **{"BK7": "Schott:N-BK7", "silica": "generic:fused silica", "SiO2": "generic:fused silica"},
+    **{"F_SILICA": "generic:fused silica", "C79-80": "generic:fused silica"},  # as Zemax and Corning call it
     **{"fluorite": "generic:CaF2", "acrylic": "generic:PMMA", "PC": "generic:polycarbonate"},
     **{"POLYCARB": "generic:polycarbonate", "PS": "generic:polystyrene", "POLYSTYR": "generic:polystyrene"},
     **{"plexiglas": "generic:PMMA", "lucite": "generic:PMMA", "perspex": "generic:PMMA"},
@@ -206,7 +208,7 @@ def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") 
     glasses = same_name(name)
     if not glasses:
         reason = _REFUSED.get(_key(name)) or _suggestion(name)
-        raise InputError(file, where, name, f"a glass of the catalogue; {reason}")
+        raise InputError(file, where, name, f"a glass of the catalogue, or of one given by --glass; {reason}")
     return glasses[0]
 
 
@@ -246,6 +248,20 @@ def _absorbing() -> tuple[list[Glass], NDArray[np.float64], NDArray[np.float64]]
     return glasses, figures, np.array([g.absorption_per_mm(LINE_G_NM) for g in glasses])
 
 
+def figures_of_code(code: str) -> tuple[float, float] | None:
+    """Return n_d and V_d of a glass code, else None: the fraction of the index, and the Abbe number without its point.
+
+    It is written as 517642, 517.642, 517.64 or 516800.641700. No glass has an index below 1.3: 003283 stands for 2.003
+    and 28.3, as 1003300.283000 does with more digits.
+    """
+    match = re.fullmatch(r"([0-9]{3,7})\.([0-9]{2,6})|([0-9]{3})([0-9]{3})", code)
+    if not match:
+        return None
+    index, abbe = match[1] or match[3], match[2] or match[4]
+    n_d = 1 + int(index) / 10 ** min(len(index), 6)
+    return n_d + (n_d < _LEAST_INDEX), int(abbe) / 10 ** (len(abbe) - 2)
+
+
 def by_code(code: str, count: int = 3) -> list[Glass]:
     """Return the `count` glasses nearest to a six-digit code.
 
@@ -256,9 +272,10 @@ def by_code(code: str, count: int = 3) -> list[Glass]:
         InputError: a code that is not six digits.
     """
     digits = re.sub(r"[./ ]", "", code)
-    if not re.fullmatch(r"[0-9]{6}", digits):
+    figures = figures_of_code(digits) if len(digits) == 6 else None
+    if figures is None:
         raise InputError("glass catalogue", "code", code, 'six digits such as "517642" for n_d = 1.517, V_d = 64.2')
-    n_d, V_d = 1 + int(digits[:3]) / 1000, int(digits[3:]) / 10
+    n_d, V_d = figures
 
     def rank(g: Glass) -> float:
         # Rounded as codes are, so that all glasses of one code count as equally near.

@@ -173,6 +173,11 @@ class Shot:
         """The settings that are given, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
+    @property
+    def size(self) -> dict[str, Any]:
+        """The settings that zoom or scale the lens, of those that are given."""
+        return {name: self.given[name] for name in ("zoom", "focal_length_mm", "field_deg") if name in self.given}
+
     def whole(self) -> Self:
         """Return the shot with defaults for the settings that are not given."""
         return type(self)(**self.given)

@@ -41,6 +41,7 @@ REFUSED = by_word(
     ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
     ("GRN", "a medium without a gradient index"),
     ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
+    ("INT", "a surface without a file of its deformations"),
     ("RMD", "a surface that refracts: the lens model has no mirrors"),
     ("BEN RET GLB", "tilts and decentres by XDE to CDE, DAR and REV: a bend belongs to a mirror"),
     ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
@@ -61,6 +62,7 @@ READ = (
     *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM DAR REV".split(),
     *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0, *TURNS, *SOLVES),
 )
+NO = ("N", "NO")
 ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
 # Control codes, fields, vignetting factors, weights and wavelengths, which move no ray in a zoom.
 NOT_ZOOMED = frozenset(
@@ -192,7 +194,7 @@ def _system(file: File, command: Command) -> bool:
     name, words, line = command.name, command.words, command.line
     match name:
         case "RDM":
-            file.radii = not (words and words[0].upper() in ("N", "NO"))
+            file.radii = not (words and words[0].upper() in NO)
         case "TIT" if words and words[0].upper().startswith("Z") and words[0][1:].isdecimal():
             file.zoom.titles[int(words[0][1:]) - 1] = " ".join(words[1:]).strip("\"' ")
         case "TIT":
@@ -242,8 +244,8 @@ def _surface(file: File, command: Command) -> None:
     match name:
         case "STO":
             block.stop = True
-        case "PIM":
-            block.solved = True
+        case "PIM":  # behind the image, too, it speaks of the last surface
+            file.blocks[-2 if file.closed else -1].solved = not (words and words[0].upper() in NO)
         case "GLA":
             block.medium = medium(command, words, file.private)
         case "SPS" | "SCO":

@@ -49,15 +49,9 @@ _DARKEST = 1e-6  # a transmittance of 0 says no more than that it is below this
 
 
 def by_code(word: str) -> MediumFields | None:
-    """Return the fields of a glass code, else None: the fraction of the index, and the Abbe number without its point.
-
-    It is written as 517642, 517.642 or 516800.641700.
-    """
-    code = re.fullmatch(r"([0-9]{3,6})\.([0-9]{3,6})|([0-9]{3})([0-9]{3})", word)
-    if not code:
-        return None
-    index, abbe = (code[1], code[2]) if code[1] else (code[3], code[4])
-    return {"n_d": 1 + int(index) / 10 ** len(index), "V_d": int(abbe) / 10 ** (len(abbe) - 2)}
+    """Return the fields of a glass code, as `lens.glass.figures_of_code` reads it, else None."""
+    figures = catalogue.figures_of_code(word)
+    return {"n_d": figures[0], "V_d": figures[1]} if figures else None
 
 
 def named_glass(

@@ -183,6 +183,9 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             file.f_number = line.positive(word, rest)
             file.working = line if rest[1:2] == ["1"] else None
         case "OBNA":
+            if rest[1:2] == ["1"]:
+                expected = "a numerical aperture, with flag 0: an angle of the object's cone is not read"
+                raise line.error(word, " ".join(rest), expected)
             file.object_na = line.positive(word, rest[:1])
         case "ENVD":
             if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
@@ -376,7 +379,7 @@ def _complete(file: File) -> None:
         if math.isnan(block.thickness):
             raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
     file.rows = placed(rows, file.blocks[1:])
-    if image.thickness or image.medium or image.stop:
+    if image.thickness or image.stop or image.medium not in ({}, middle[-1].medium):
         raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
     if image.curvature:
         warn(file.file, "the image surface is curved; the film is taken as plane")

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import check_bounds, setting
+from neurolens.base.settings import check_bounds, read_config, setting
 from neurolens.optics.lens.designs import with_assumptions
 from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
@@ -52,6 +53,11 @@ class Tolerances:
 
     def __post_init__(self) -> None:
         check_bounds(self, "tolerances")
+
+    @classmethod
+    def read(cls, file: Path | None) -> Tolerances:
+        """Return the limits that a TOML file states; without one, or by the word default, those of this class."""
+        return cls() if file is None or file == Path("default") else read_config(cls, file)
 
 
 def elements_of(lens: Lens) -> list[range]:

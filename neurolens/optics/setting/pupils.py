@@ -362,7 +362,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
         radii, points = radii[:: len(radii) // 60], 384
     on_axis = _illumination(lens, radii[:1], points)[0]
     if not on_axis > 0:
-        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "rims that let axial light pass")
     coarse = np.arange(0, len(radii), _COARSE)
     known = _illumination(lens, radii[coarse], points)
 

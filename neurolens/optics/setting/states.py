@@ -314,7 +314,7 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
         places = places + change
         if np.abs(change).max() < 1e-13 * efl_mm:
             return places
-    raise InputError(lens.path, "zoom", efl_mm, "a position between states that its groups can reach in focus")
+    raise InputError(lens.path, "zoom", efl_mm, "another focal length: here no place of its groups is in focus")
 
 
 def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:

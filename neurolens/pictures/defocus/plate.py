@@ -226,12 +226,12 @@ def read_plate(
 
     Raises:
         InputError: there is no depth, or depth is negative or only from 0 to 1; the shape is not the film's, or that of
-            pixels not the lens's; the files have different sizes.
+            pixels not the lens's; the files have different sizes; another camera of ours than a pinhole took a picture.
     """
     header = header_of(path)
     (left, top), (last, bottom) = header["displayWindow"]
     size = int(last) - int(left) + 1, int(bottom) - int(top) + 1
-    ours = _pinhole(metadata_of(path, header))
+    ours = _pinhole(path, metadata_of(path, header))
     plate_mm = film_mm if ours is None else ours["film_mm"]
     if not math.isclose(size[0] / size[1], plate_mm[0] / plate_mm[1], rel_tol=_SAME + 1 / min(size)):
         squeeze = frame.reach_mm[1] / frame.reach_mm[0]
@@ -259,7 +259,7 @@ def read_plate(
         own = header if file == path else header_of(file)
         if not np.array_equal(own["dataWindow"], header["dataWindow"]):
             raise InputError(file, "dataWindow", f"({own['dataWindow']})".replace("\n", " "), "that of the plate")
-        settings, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
+        settings, colours = _pinhole(file, metadata_of(file, own)), read_colour_space(file) or SRGB
         from_film = settings is not None if depth.from_film is None else depth.from_film
         for rgb, metres in _layers(file, depth, several=file == path):
             w, cosine = _inverse_depth(file, metres, depth, pinhole, 1e-3 * before if from_film else 0.0)
@@ -276,7 +276,7 @@ def middle_m(path: Path, frame: Callable[[], Frame], depth: DepthSettings) -> fl
 
     `frame` gives that of the camera, where depth counts from its pinhole. Raises InputError as `read_plate`.
     """
-    ours = _pinhole(metadata_of(path, header_of(path))) is not None
+    ours = _pinhole(path, metadata_of(path, header_of(path))) is not None
     nearest: NDArray[Any] = np.full((1, 1), np.inf)
     for _, metres in _layers(path, depth, several=True):
         there = np.isfinite(metres) & (metres != 0)
@@ -287,11 +287,14 @@ def middle_m(path: Path, frame: Callable[[], Frame], depth: DepthSettings) -> fl
     return math.inf if middle >= _SKY_M else middle + (0.0 if from_film else 1e-3 * frame().pupil_mm[1])
 
 
-def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the settings of our pinhole, if it took the picture."""
+def _pinhole(path: Path, metadata: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the settings of our pinhole, if it took the picture; raises InputError if another camera of ours did."""
     camera = metadata.get("camera")
-    if not isinstance(camera, dict) or camera.get("camera") != "pinhole":
+    if not isinstance(camera, dict) or "camera" not in camera:
         return None
+    if camera["camera"] != "pinhole":
+        expected = "'pinhole': render --camera pinhole:LENS, for this picture has a lens's blur or projection already"
+        raise InputError(path, "camera", camera["camera"], expected)
     film = camera.get("film_mm")
     lengths = [camera.get("efl_mm"), *(film if isinstance(film, list) and len(film) == 2 else [None])]
     return camera if all(isinstance(v, float | int) and 0 < v < math.inf for v in lengths) else None

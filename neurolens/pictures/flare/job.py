@@ -90,5 +90,5 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     assert found.transmittance is not None
     light = math.pi * widest**2 * float(torch.where(found.status == 0, found.transmittance, 0.0).mean())
     if not light > 0:
-        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "rims that let axial light pass")
     return light

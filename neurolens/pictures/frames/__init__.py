@@ -328,7 +328,7 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
         return {}
     flaring = _flaring(prepared.camera)
     if flaring is None:
-        warn(f"no flare of {prepared.camera.name}: that takes a lens file that is traced as it is")
+        warn(f"no flare: {prepared.camera.name} has no surfaces that reflect, as a lens file has")
         return {}
     from neurolens.pictures.flare.layers import scene_flare
 

@@ -160,10 +160,11 @@ class Job:
 
     def ready(self) -> None:
         """Compile what all workers run, before they are forked: each would compile it for itself."""
-        if self.mode == "companions":
+        several = self.mode == "companions"
+        if several:
             _light_of_tile(self.spectral.bins)
-            if ready := getattr(getattr(self.camera, "camera", self.camera), "ready", None):
-                ready(self.spectral.lanes)
+        if ready := getattr(getattr(self.camera, "camera", self.camera), "ready", None):
+            ready(self.spectral.lanes if several else 1)
 
     def picture_settings(self) -> dict[str, Any]:
         """Return the settings besides scene and camera that decide the picture, for its metadata and its checkpoint."""
@@ -478,19 +479,23 @@ def identity(job: Job) -> dict[str, Any]:
     identity = {
         "neurolens": __version__,
         "scene": digest(bare),
-        "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
+        "camera": {"name": camera.name, **kept, "rays": _rays(job)},
         "film_mm": list(job.grid.film_mm),
         **job.picture_settings(),
     }
     return json.loads(json.dumps(identity, default=str))
 
 
-def _rays(camera: Camera) -> str:
-    """Return a digest of the rays of a fixed set of samples, which tells cameras apart."""
-    random = np.random.default_rng(0)
+def _rays(job: Job) -> str:
+    """Return a digest of the camera's rays of a fixed set of samples, of as many wavelengths as the job's."""
+    camera, random = job.camera, np.random.default_rng(0)
     film = ((random.random((2, _PROBES)) - 0.5) * np.array(camera.film_mm)[:, None]).astype(np.float32)
     low, high = camera.wavelength_nm or LIGHT_NM
     nm = np.linspace(low, high, _PROBES).astype(np.float32)
-    rays = camera.sample(film, random.random((2, _PROBES), np.float32), nm)
+    square = random.random((2, _PROBES), np.float32)
+    if job.mode == "companions":
+        rays = camera.sample_spectrum(film, square, np.tile(nm, (job.spectral.lanes, 1))).rays  # type: ignore[attr-defined]
+    else:
+        rays = camera.sample(film, square, nm)
     passed = rays.status == 0
     return digest([rays.status, *(np.where(passed, p, 0) for p in (rays.origin_m, rays.direction, rays.weight))])

@@ -141,7 +141,7 @@ def _ideal(probed: Probe, target: Target) -> Iterator[Choice]:
                 continue
             maps = Warped(camera, probed.exact, probed.shot.focus_m)
             if maps.area < _MOST_OVERSCAN:
-                how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
+                how = f"its picture, of {maps.area:.3g} times the area, warped by the map of 'neurolens stmap'"
                 yield judged(probed, f"{name}{MAPPED}", spec, maps, plain.made, how=how, area=maps.area)
 
 

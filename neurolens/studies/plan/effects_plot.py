@@ -11,29 +11,30 @@ from neurolens.studies.plan.plan import Plan
 from neurolens.studies.plan.probe import Effect
 from neurolens.studies.plots import error_scale, log_norm
 
-_A_ROW, _ROW_IN = 4, 1.9  # maps in a row, and the height of a row in inches
+_A_ROW, _MAP_IN = 4, (2.1, 1.8)  # most maps in a row; width and height of a map in inches
 
 
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
     """Draw the map of each effect that a camera needs, or of all where it needs none, on one scale for each unit."""
     shown = [e for e in plan.effects if e.needed] or plan.effects
     units = [part for unit in ("px", "relative") if (part := [e for e in shown if e.unit == unit])]
-    heights = [_ROW_IN * -(-len(part) // _A_ROW) for part in units]
+    columns = min(_A_ROW, max(map(len, units)))
+    heights = [_MAP_IN[1] * -(-len(part) // columns) for part in units]
     subtitle = f"f/{plan.asked.f_number:.3g}, focus {plan.asked.focus_m:g} m; 95% of the picture keeps these figures"
-    with drawing(path, 9.5, sum(heights) + 0.8, title, subtitle) as figure:
+    with drawing(path, max(_MAP_IN[0] * columns + 1.0, 5.0), sum(heights) + 0.8, title, subtitle) as figure:
         parts = np.atleast_1d(figure.subfigures(len(units), 1, height_ratios=heights))
         for part, effects in zip(parts, units, strict=True):
-            _maps(part, effects, plan.probed.shot.film_mm)
+            _maps(part, effects, columns, plan.probed.shot.film_mm)
 
 
-def _maps(figure: Any, effects: Sequence[Effect], film_mm: tuple[float, float]) -> None:
+def _maps(figure: Any, effects: Sequence[Effect], columns: int, film_mm: tuple[float, float]) -> None:
     """Draw effects of one unit, upright, with their colour bar: light that the lens takes is violet."""
     from matplotlib.colors import Normalize
 
     pixels, maps = effects[0].unit == "px", [e.film for e in effects]
     low, high = error_scale(map(np.abs, maps), 98)
     norm, colours = (log_norm(low, high), "magma") if pixels else (Normalize(-high, high), "PuOr_r")
-    cells = figure.subplots(-(-len(effects) // _A_ROW), _A_ROW, squeeze=False)
+    cells = figure.subplots(-(-len(effects) // columns), columns, squeeze=False)
     for axes in cells.ravel():
         axes.set_axis_off()
     for axes, effect, value in zip(cells.ravel(), effects, maps, strict=False):

@@ -226,7 +226,10 @@ def test_the_command_fits_a_lens_and_writes_what_programs_read(
     assert told["rms_px"] < 0.05 and told["centre_px"] == pytest.approx([959.5 - 160, 539.5 - 2 * 1920 / 36])
     kinds = {"kannala-brandt": 0.5, "f-theta": 0.5}  # pixels RMS of 10 mm, 220 degrees
     for kind, most in kinds.items():
-        told = run_json(capsys, "projection", FISHEYE, *PICTURE, "--projection", kind, "-o", tmp_path / kind)
+        asked = (
+            () if kind == "kannala-brandt" else ("--projection", kind)
+        )  # so wide a field takes the fisheye by itself
+        told = run_json(capsys, "projection", FISHEYE, *PICTURE, *asked, "-o", tmp_path / kind)
         assert told["rms_px"] < most and told["field_deg"] > 95
     assert json.loads((tmp_path / "kannala-brandt.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
     theta = json.loads((tmp_path / "f-theta.json").read_text())
@@ -242,4 +245,5 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         (GAUSS, ("--projection", "opencv", "--height", "1920"), "shape of the film"),
     ):
         assert words in failure(capsys, "projection", camera, *PICTURE, *change)
-    assert get_args(get_type_hints(command.Projection)["projection"]) == tuple(NAMES) and not list(tmp_path.iterdir())
+    kinds = get_args(get_type_hints(command.Projection)["projection"])[0]
+    assert get_args(kinds) == tuple(NAMES) and not list(tmp_path.iterdir())

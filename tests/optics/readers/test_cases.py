@@ -324,11 +324,18 @@ def heard_text(text: str, tmp_path: Path) -> tuple[Lens, str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "n_d"), [("SSK4", 1.6177), ("LEXAN", 1.5855), ("Plexiglas", 1.4918), ("STYRON", 1.591)]
+    ("name", "n_d"),
+    [("SSK4", 1.6177), ("LEXAN", 1.5855), ("Plexiglas", 1.4918), ("STYRON", 1.591), ("F_SILICA", 1.4585)],
 )
 def test_old_glasses_and_trade_names_are_known(name: str, n_d: float, tmp_path: Path) -> None:
     lens, _ = heard_text(swapped("GLAS N-BK7", f"GLAS {name}"), tmp_path)
     assert lens.surfaces[0].n_d == pytest.approx(n_d, abs=1e-3)
+
+
+def test_an_archive_says_what_to_give_instead(tmp_path: Path) -> None:
+    (tmp_path / "lens.zar").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match=r"an archive of Zemax; give the lens file \(.zmx\)"):
+        read_any(tmp_path / "lens.zar")
 
 
 def test_a_matrix_of_polarisation_moves_no_ray(tmp_path: Path) -> None:

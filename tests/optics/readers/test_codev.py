@@ -70,6 +70,9 @@ def test_singlet_by_the_lensmakers_formula(text: str, tmp_path: Path) -> None:
         ("517.642", 1.517, 64.2, None),
         ("517642", 1.517, 64.2, None),
         ("516800.641700", 1.5168, 64.17, None),
+        ("516.64", 1.516, 64.0, None),  # as OpTaliX writes it
+        ("003283", 2.003, 28.3, None),  # no glass has an index of 1.003
+        ("1003300.282700", 2.0033, 28.27, None),
         ("1.5168:64.17", 1.5168, 64.17, None),
         ("1.5168 64.17", 1.5168, 64.17, None),
         ("1.5168", 1.5168, None, None),
@@ -162,6 +165,9 @@ def test_units_and_defocus(tmp_path: Path) -> None:
     assert read(swapped("SI    0.0 0.0", "SI 0.0 -0.5"), tmp_path).surfaces[-1].thickness_mm == 44.5
     focused = read(swapped("-50.0 45.0", "-50.0 0.0\n PIM"), tmp_path)
     assert focused.surfaces[-1].thickness_mm == pytest.approx(first_order(focused).back_focus_mm)
+    bare = swapped("-50.0 45.0", "-50.0 0.0")
+    assert read(swapped("GO", "PIM YES\nGO", bare), tmp_path) == focused
+    assert read(swapped("GO", "PIM NO\nGO", bare), tmp_path).surfaces[-1].thickness_mm == 0.0
 
 
 @pytest.mark.parametrize(
@@ -211,6 +217,7 @@ def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -
         ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'NBK8'.*N-BK7"),
         ("NBK7_SCHOTT", "REFL", r"line 12, S: got 'REFL'.*no mirrors"),
         ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),
+        ("  STO", "  INT worn.int", r"line 14, INT: got 'worn.int', expected.*deformations"),
         ("  STO", "  GRT", r"line 14, GRT: got .*given.*no grating"),
         ("  STO", "  STO; XOD 3", r"line 14, XOD: got 3.0, expected 0"),
         ("  STO", "  STO; SPS QBF", r"NRADIUS of SPS QBF: got 0.0, expected a normalisation radius above 0"),

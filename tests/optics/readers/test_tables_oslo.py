@@ -187,6 +187,21 @@ def test_the_image_of_oslo_is_where_its_thickness_says_and_plane(tmp_path: Path)
         assert read(text, ".len", tmp_path).surfaces[-1].thickness_mm == 46.25
 
 
+def test_the_beam_of_oslo_is_measured_at_surface_1(tmp_path: Path) -> None:
+    """The paraxial ray from a near axial point to the height EBR on surface 1 meets the edge of the stop behind it."""
+    text = swapped("TH   1.0e+20", "TH 500", swapped("AST\n", "", swapped("PY   0.0", "PY 0.0; AST", OSLO)))
+    lens, n = read(swapped("AP CHK 9.0", "AP 9.0", text), ".len", tmp_path), catalogue.find("BK7").n_d
+    behind = (5 / 500 - 5 * (n - 1) / 50) / n
+    assert lens.surfaces[1].stop and lens.surfaces[1].semi_diameter_mm == pytest.approx(5 + 5 * behind, rel=1e-12)
+
+
+def test_terms_beyond_those_of_oslo_bend_rays_too(tmp_path: Path) -> None:
+    text = swapped("RD   50.0", "RD 50.0; CC -1; AD 1e-6; AG -1e-13; AH 2e-16; AI 0", OSLO)
+    with pytest.warns(AssumedWarning, match=r"line 13: AH is taken as the coefficient of r\^12"):
+        shape = read(text, ".len", tmp_path).surfaces[0].figure
+    assert shape.conic == -1 and shape.asphere == ((4, 1e-6), (10, -1e-13), (12, 2e-16))
+
+
 def test_a_glass_of_oslo_says_whose_it_is_taken_for(tmp_path: Path) -> None:
     with pytest.warns(NeurolensWarning, match=r"glass BK7 is taken as Schott:N-BK7 \(n_d 1.51680"):
         read(OSLO, ".len", tmp_path)

@@ -155,6 +155,15 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
     assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, ReadOptions(units="in")) == inches
 
 
+def test_an_image_under_water_is_no_file_cut_off(tmp_path: Path) -> None:
+    """Programs repeat the medium of the image behind it."""
+    glass = "GLAS ___BLANK 1 0 1.333 55.8"
+    wet = swapped("DISZ 45.0", f"DISZ 45.0\n  {glass}")
+    assert read(swapped("DISZ 0\n", f"DISZ 0\n  {glass}\n", wet), tmp_path) == read(wet, tmp_path)
+    with pytest.raises(InputError, match="is the file cut off"):
+        read(swapped("DISZ 0\n", "DISZ 0\n  GLAS N-BK7\n", wet), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -260,6 +269,7 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
     [
         ("MODE SEQ", "MODE NSC", r"line 2, MODE: got 'NSC'"),
         ("UNIT MM", "UNIT FURLONG", r"line 6, UNIT: got 'FURLONG', expected one of MM"),
+        ("ENPD 10", "OBNA 0.5 1", r"line 7, OBNA: got '0.5 1', expected a numerical aperture, with flag 0"),
         ("ENPD 10", "OBNA 0.1 0", r"numerical aperture of the object: got 0.1, expected.*a finite distance"),
         ("CURV 2.0E-2", "CURV 2.0E+4", r"focal length: got [-0-9.e]+, expected at least a hundredth of the thickest"),
         ("GLAS N-BK7", "GLAS N-BK8", r"GLAS: got 'N-BK8', expected a glass.*N-BK7"),

@@ -171,6 +171,7 @@ def test_absorption_is_linear_between_samples_and_constant_outside() -> None:
 def test_six_digit_codes() -> None:
     assert [str(g) for g in catalogue.by_code("517642")][0] == "Schott:N-BK7"
     assert {"N-BK7", "BSC7", "H-K9L"} <= {g.name for g in catalogue.by_code("517.642", 8)}
+    assert catalogue.by_code("003283")[0].n_d == pytest.approx(2.0033, abs=1e-3)
     for bad in ("51764", "n-bk7", "5176421", "-17642", "５１７６４２"):
         with pytest.raises(InputError, match="six digits"):
             catalogue.by_code(bad)

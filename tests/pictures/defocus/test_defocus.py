@@ -419,6 +419,10 @@ def test_the_command_writes_a_picture_with_its_camera(tmp_path: Path, capsys: py
     planes, metadata = read_channels(tmp_path / "raw.exr")
     electrons = (planes["raw"] - metadata["sensor"]["black_level"]) * metadata["sensor"]["electrons_per_number"]
     np.testing.assert_allclose(electrons, 1000 * planes["G"], atol=2)
+    write_channels(tmp_path / "blurred.exr", read_channels(plate)[0], None, metadata)  # blur of blur is no lens's
+    assert "camera: got 'thin', expected 'pinhole'" in failure(
+        capsys, *command(tmp_path / "blurred.exr", tmp_path / "twice.exr")
+    )
 
 
 def test_layers_of_a_file_are_found_by_their_names(tmp_path: Path) -> None:

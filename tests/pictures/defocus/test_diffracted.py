@@ -124,10 +124,12 @@ def test_the_star_is_that_of_flare() -> None:
     assert 0.5 * np.abs(ours - star).sum() < 0.02
 
 
-def test_commands_spread_light_and_say_so(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_spread_light_and_say_so(
+    tmp_path: Path, scene: Path, one_camera: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A small picture of small pixels at f/22: edges become soft, and the light stays."""
     words = ["render", scene, "--camera", LENS, "--film", "0.3x0.2", "--width", 30, "--f-number", 22, "--samples", 4]
-    words += ["--runtime", "onnxruntime", "--quiet"]
+    words += ["--threads", 1, "--quiet"]
     pictures = []
     for name, more in (("rays", ()), ("waves", ("--diffraction",))):
         run_json(capsys, *words, *more, "-o", tmp_path / f"{name}.exr")
@@ -175,7 +177,9 @@ def test_kernels_of_bokeh_are_sums_of_waves_or_spread_rays(tmp_path: Path, capsy
     assert area[1] > 100 * area[0]
 
 
-def test_a_point_of_a_plate_becomes_airys_disc(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_point_of_a_plate_becomes_airys_disc(
+    tmp_path: Path, one_camera: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`defocus` keeps its light, and green within a radius is that of Airy's discs of its wavelengths."""
     size, pixel = 264, 0.003
     planes = {name: np.zeros((size, size), np.float32) for name in "RGB"} | {

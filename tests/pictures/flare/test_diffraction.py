@@ -96,6 +96,15 @@ def test_light_of_the_pupil_is_that_of_rays(light: Light) -> None:
     assert light_of(pupil, p.outline(pupil)) == pytest.approx(expected, rel=3e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "light"), [("canon_50mm_f1_2", Light(10.1, 6.8)), ("sony_fe_14mm_f1_8_gm", Light(35.0, 15.0))]
+)
+def test_an_opening_has_one_edge(name: str, light: Light) -> None:
+    """Beyond the rays the fitted places at the rims let light pass, which made bright dots a centimetre off."""
+    pupil = p.exit_pupil(lens_of(name), light, NM)
+    assert pupil is not None and len(p.outline(pupil)) == 1
+
+
 def test_polygons_near_and_far() -> None:
     """Six blades: the field fringe by fringe; means over pixels 100 pixels out, on a streak, beside it, and between."""
     pupil, lines = made(16.0, Aperture(blades=6))

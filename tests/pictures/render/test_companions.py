@@ -1,7 +1,6 @@
 """Several wavelengths on the path of a lens that disperses: the same scene ray, the same light, less noise."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +17,6 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, Note
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera, light_on_axis
-from neurolens.graph import compiler
 from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.lensfile import read_lens
@@ -45,14 +43,6 @@ NARROW = {
     "sodium": {"spectrum": [[380, 0.0], [580, 0.0], [589, 1.0], [598, 0.0], [780, 0.0]]},
     "led": {"spectrum": [[380, 0.0], [430, 0.0], [452, 1.0], [478, 0.15], [560, 0.6], [620, 0.45], [720, 0.0]]},
 }
-
-
-@pytest.fixture(autouse=True, scope="module")
-def quick() -> Iterator[None]:
-    """Compiled with less effort: -O3 is for those who render."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiler, "FLAGS", ("-std=c99", "-O1", "-march=native"))
-        yield
 
 
 @cache

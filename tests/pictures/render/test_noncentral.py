@@ -144,7 +144,7 @@ def test_a_camera_with_a_centre_has_rays_through_it() -> None:
 
 def test_the_page_reads_a_table_that_does_not_span_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("yaml", reason="PyYAML (extra dev) is not installed")
-    page = (ROOT / "docs" / "pages" / "how-to" / "st-maps.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "pages" / "how-to" / "projection.md").read_text(encoding="utf-8")
     code = next(block for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "noncentral" in block)
     camera = make_camera("fisheye-equidistant", Shot(film_mm=(36.0, 24.0), focus_m=1.0))
     field = field_of(camera, 1.0, "equidistant", spectrum=spectrum_of(camera, only_nm=550.0))
