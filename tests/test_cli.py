@@ -132,6 +132,11 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         (["stmap", GAUSS, "--resolution", "64"], ["--resolution 64; did you mean '--width'?"]),
         (["render", "room"], ["--camera: got (missing)", "one scene and one camera"]),
         (["render", "room", GAUSS], ["SCENE: got '", "one scene and one camera"]),
+        (["render", "rom"], ["'rom'", "lights", "did you mean 'room'?"]),
+        (["render", "room", "--lens", "no_lens"], ["no_lens", "missing"]),  # --lens is --camera, and the other way
+        (["plan", "room", "--camera", "no_lens"], ["no_lens", "missing"]),
+        (["render", "room", "--tilt", "3"], ["did you mean '--film-tilt'?"]),
+        (["evaluate", GAUSS], ["MODEL: got '", "an exported model (.onnx)"]),
         (["render", "room", "--fnumber=2"], ["--fnumber=2; did you mean '--f-number'?", "neurolens render --help"]),
         (["lens", GAUSS, "-o", "a.toml"], ["-o"]),
         (["lens", GAUSS, "--derive-rims", "--layout", "a.png"], ["--layout"]),

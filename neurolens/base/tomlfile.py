@@ -111,13 +111,15 @@ _ELSEWHERE = {  # what other programs call a setting
     **dict.fromkeys(("resolution", "res", "size", "resolution_x"), "width"),
     **dict.fromkeys(("focus_distance", "focal_distance", "distance"), "focus"), "spp": "samples",
     **dict.fromkeys(("sensor", "sensor_size", "sensor_width", "filmback"), "film"),
+    **{move: f"film_{move}" for move in ("tilt", "swing", "shift", "rise")},
 }  # fmt: skip
 
 
 def suggestion(word: str, known: Sequence[str]) -> str:
     """Return "; did you mean ...?" with the nearest known key, or nothing; a key that only lacks its unit is near."""
-    meant = _ELSEWHERE.get(word.replace("-", "_"), word) + "_"
-    near = [key for key in known if f"{key}_".replace("-", "_").startswith(meant)]
+    keys = {f"{key}_".replace("-", "_"): key for key in known}
+    meant = [_ELSEWHERE.get(word.replace("-", "_"), word), word]
+    near = [key for name in meant for at, key in keys.items() if at.startswith(f"{name}_")]
     near = near or get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 

@@ -370,9 +370,12 @@ def named_lens(models: bool, cameras: bool, text: str) -> Any:
 
 def scene_file(text: str) -> Path:
     """Read an argument that names a scene file: its path, else its path in a checkout or its name, as it ships."""
-    path, shipped = Path(text), library()
-    places = path, shipped / path, shipped / "experiments" / "scenes" / f"{text}.toml"
-    return next((place for place in places if place.is_file()), path)
+    path, ours = Path(text), {file.stem: file for file in (library() / "experiments" / "scenes").glob("*.toml")}
+    found = next((place for place in (path, library() / path) if place.is_file()), ours.get(text))
+    if found is None and path.stem == text:
+        names = f"{', '.join(sorted(ours))}{suggestion(text, list(ours))}"
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a scene file (.toml), or one that ships: {names}")
+    return found or path
 
 
 def floats(text: str, between: str = ",") -> list[float]:

@@ -53,7 +53,7 @@ examples:
     kept = "no picture was written; older files of that name are untouched"
 
     plate: Path = setting(..., "OpenEXR file, sharp, with depth", positional=True, metavar="PLATE.exr")
-    lens: str = cli.lens(models=True, cameras=True, metavar="LENS")
+    lens: str = cli.lens(models=True, cameras=True, metavar="LENS", old=("camera",))
     film: tuple[float, float] = cli.film()
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     behind: tuple[Path, ...] = setting(

@@ -32,7 +32,7 @@ examples:
     kept = "no picture was written; older files of that name are untouched"
 
     scene: str = setting(..., "scene file (.xml), or cornell-box", positional=True, metavar="SCENE")
-    camera: str = cli.lens(models=True, cameras=True)
+    camera: str = cli.lens(models=True, cameras=True, old=("lens",))
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     variant: str | None = setting(None, "variant of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)")
     samples: int | None = setting(None, "samples of a pixel (default: the scene's)", within=(1, 1 << 20), common=True)

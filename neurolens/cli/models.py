@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import ModelError, NeurolensWarning
 from neurolens.base.files import library
-from neurolens.base.lensname import lens_id_of
+from neurolens.base.lensname import is_model, lens_id_of
 from neurolens.base.records import Timing, program, reaches, time_of
 from neurolens.base.report import OPTIONAL, PART, Report
 from neurolens.base.settings import setting, whole
@@ -273,6 +273,8 @@ keeps its own; ./lenses; the project's."""
         from neurolens.studies.check import check_model, check_states, lens_of_card, space_of_card
         from neurolens.studies.speed import time_model
 
+        if not is_model(self.model):
+            self.refuse("MODEL", self.model, "an exported model (.onnx): neurolens train makes them of a lens")
         model = load_model(self.model)
         space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None
         lens = space.lens if space else lens_of_card(model.card, self.lens, self.model)

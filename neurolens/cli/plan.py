@@ -48,7 +48,7 @@ fitted), and plan.toml, which 'render' and 'export' take for the camera."""
         ..., "scene file (.toml), or its name in experiments/scenes", positional=True, metavar="SCENE",
         kind=cli.scene_file,
     )  # fmt: skip
-    lens: Path = cli.lens()
+    lens: Path = cli.lens(old=("camera",))
     budget: float = setting(
         0.25, "error allowed, as 0.25px (default)", kind=_budget, metavar="BUDGET", common=True,
     )  # fmt: skip

@@ -73,7 +73,7 @@ examples:
         (), "scene file (.toml) or its name in experiments/scenes, or tiles of --merge", positional=True,
         metavar="SCENE", nargs="*", kind=cli.scene_file,
     )  # fmt: skip
-    camera: str | None = cli.lens(None, models=True, cameras=True)
+    camera: str | None = cli.lens(None, models=True, cameras=True, old=("lens",))
     out: Path = cli.output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)

@@ -52,7 +52,7 @@ def read_measured(path: Path) -> Measured:
         InputError: another table, a contrast outside 0 to 1, a place without one of the frequencies, or fewer than five
             places.
     """
-    rows = read_rows(path, "measured contrasts")
+    rows = read_rows(path, "a list of measured contrasts")
     found = dict[tuple[float, float], dict[float, tuple[float, float]]]()
     for number, row in enumerate(rows, 1):
         try:
