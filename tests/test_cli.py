@@ -650,7 +650,7 @@ def test_a_scene_that_ships_is_found_by_name_or_path_and_a_file_here_comes_first
     shipped = ROOT / "experiments" / "scenes" / "room.toml"
     assert scene_file("room") == scene_file("experiments/scenes/room.toml") == shipped
     (tmp_path / "room").touch()
-    assert scene_file("room") == Path("room") and scene_file("no-such") == Path("no-such")
+    assert scene_file("room") == Path("room") and scene_file("no-such.toml") == Path("no-such.toml")
 
 
 def test_a_converted_lens_is_scaled_as_commands_scale_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ Errors are one line and exit code 2, or 70 where neurolens itself is at fault.
 """
 
 import argparse
+import gc
 import io
 import os
 import signal
@@ -30,6 +31,7 @@ from neurolens.base.errors import (
 from neurolens.base.tasks import handled
 from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
+_OBJECTS = 50_000  # made between two searches for garbage, which else take a twelfth of a command's time
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
 _RENAMED = {"merge": ("render", "--merge"), "trade": ("plan", "--explain")}  # names that commands had, which still work
@@ -137,6 +139,8 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] | None =
             f"another project called neurolens is installed over this one ({neurolens.__file__}): "
             "pip uninstall neurolens, then install this one again"
         )
+    if argv is None:  # a program of its own: packages and graphs are objects by the 100,000, of which few are garbage
+        gc.set_threshold(_OBJECTS)
     words = sys.argv[1:] if argv is None else argv
     if not words and build is None:
         print(_FIRST)
