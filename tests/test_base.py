@@ -348,17 +348,17 @@ def test_torch_keeps_compiled_code_in_a_folder_of_this_user_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its own choice is a folder in the shared temporary one, whoever made it: planted code ran."""
-    trace = pytest.importorskip("neurolens.optics.trace.rays")
+    peers = pytest.importorskip("experiments.peers.rays")
     places = pytest.importorskip("torch._inductor.runtime.cache_dir_utils")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
-    trace.compile_tracing(lambda: None)
+    peers.compile_tracing(lambda: None)
     folder = Path(places.cache_dir())
     assert folder == tmp_path / "neurolens" / "torch" and folder.stat().st_mode & 0o077 == 0
     folder.chmod(0o777)  # then anybody may have put code there
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
-    trace.compile_tracing(lambda: None)
+    peers.compile_tracing(lambda: None)
     assert not Path(places.cache_dir()).is_relative_to(tmp_path)
 
 

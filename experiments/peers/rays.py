@@ -44,6 +44,7 @@ import torch
 from experiments import lab
 from experiments.peers.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Peer, Prepared, Task, table_of
 from experiments.speed.tracer_race import has_avx512
+from neurolens.base.files import cache_folder
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxlens import BATCH
 from neurolens.graph.compiler import FLAGS, find_compiler, has_compiler
@@ -55,10 +56,12 @@ from neurolens.models.fitted import Domain
 from neurolens.models.source import fused_program
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.analysis.plots import drawing, plain_log_ticks
+from neurolens.optics.lens import glass
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays
-from neurolens.optics.trace.rays import compile_tracing, trace
+from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.shapes import centred, start_of
 from neurolens.optics.trace.tracegraph import exact_graph
 from neurolens.studies.plots import place_labels
 from neurolens.studies.speed import CompiledSource, Unavailable
@@ -114,6 +117,25 @@ def in_torch(run: Callable[..., Any], dtype: torch.dtype, device: str = "cpu") -
 
 def whole_trace(lens: Lens, fx: Any, fy: Any, fz: Any, px: Any, py: Any, pupil_z: float, wavelength: Any) -> Any:
     return trace(lens, camera_rays(fx, fy, fz, px, py, pupil_z), wavelength)
+
+
+def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph: bool = False) -> Callable[..., Any]:
+    """Compile a function that traces rays through a lens with torch, with the prescription folded in as constants.
+
+    Every new number of rays compiles anew, so call the result with batches of one length. Without a C++ compiler the
+    first call raises torch's own error; `trace` itself needs none.
+
+    What the compiler may take for constant is marked in here and not at import, because marking imports the compiler,
+    which takes longer than a camera needs to start. Torch keeps the machine code that it makes, and runs what it finds:
+    by default in a folder that every user of the machine can create. So its cache is moved into the user's own folder.
+    """
+    for surface in lens.surfaces if lens else ():  # read the catalogue now: compiled code cannot read files
+        glass.index_of(surface, glass.LINE_D_NM)
+    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache_folder("torch"))
+    for constant in (start_of, centred):
+        torch.compiler.assume_constant_result(constant)
+    return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 
 
 def too_long(task: Task) -> Prepared:

@@ -136,13 +136,12 @@ class ExactCamera(LensCamera):
     ) -> tuple[NDArray[np.float64], FloatArray, NDArray[np.int32]]:
         import torch
 
-        from neurolens.optics.trace.rays import trace
+        from neurolens.optics.trace.rays import plain_trace
 
         # Light starts a millimetre in front of the surface, which then lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([position + direction, -direction]), posinf=0, neginf=0)
-        with torch.no_grad():
-            *light, wavelength = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in (*rays, wavelength_nm))
-            done = trace(self.lens, Rays(*light), wavelength, towards="film", transmittance=True)
+        *light, wavelength = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in (*rays, wavelength_nm))
+        done = plain_trace(self.lens, Rays(*light), wavelength, towards="film", transmittance=True)
         assert done.transmittance is not None
         x, y, z, dx, dy, dz, through = (c.double().numpy() for c in (*done.rays, done.transmittance))
         planes = (self.film.film_z_mm, self.film.outline.pupil_z_mm)

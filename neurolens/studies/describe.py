@@ -37,7 +37,7 @@ from neurolens.optics.setting.check import Check, check_lens, doubts, verdict
 from neurolens.optics.setting.focusing import at_infinity, groups_reach_m
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm
 from neurolens.optics.setting.states import set_lens, wider_than_stated
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.pictures.flare.ghosts import GhostTracer, ghost_table
 from neurolens.pictures.flare.lights import Light
 from neurolens.pictures.render.colour import SpectralRange
@@ -240,8 +240,7 @@ def field_reached_deg(lens: Lens, domain: Domain, film_z: float, axis: Literal["
     u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[100:], indexing="ij"))
     edge, zero = torch.full_like(u, domain.film_radius_mm), torch.zeros_like(u)
     film, pupil = ((edge, zero), (u, v)) if axis == "x" else ((zero, edge), (v, u))
-    with torch.no_grad():
-        out = trace(lens, camera_rays(*film, film_z, *pupil, domain.pupil_z_mm))
+    out = plain_trace(lens, camera_rays(*film, film_z, *pupil, domain.pupil_z_mm))
     passed = out.status == st.PASSED
     if not passed.any():
         return None
@@ -252,9 +251,8 @@ def field_reached_deg(lens: Lens, domain: Domain, film_z: float, axis: Literal["
 def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, list[Ended]]:
     """Return the share of a domain's rays that pass, and what ends the others, largest share first."""
     rays = sample_domain(domain, _RAYS, seed)
-    with torch.no_grad():
-        start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
-        status = trace(lens, start, rays.wavelength_nm).status
+    start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
+    status = plain_trace(lens, start, rays.wavelength_nm).status
     codes, counts = (t.tolist() for t in torch.unique(status, return_counts=True))
     share = {int(code): count / _RAYS for code, count in zip(codes, counts, strict=True)}
     passed = share.pop(st.PASSED, 0.0)

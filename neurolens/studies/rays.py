@@ -23,7 +23,7 @@ from neurolens.models.pairs import PairSet, focused_plane_z_mm, sample_domain
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays, image_radius_mm
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.optics.trace.surfaces import Rays
 
 FIELD_LIMIT_DEG = 60.0
@@ -255,8 +255,7 @@ def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor)
     steps = torch.tensor([[h, -h, 0, 0], [0, 0, h, -h]], dtype=torch.float64).repeat_interleave(len(inputs), 1)
     film_x, film_y, film_z, pupil_x, pupil_y, wavelength = (c.repeat(4) for c in inputs.columns())
     rays = camera_rays(film_x + steps[0], film_y + steps[1], film_z, pupil_x, pupil_y, domain.pupil_z_mm)
-    with torch.no_grad():
-        out = trace(lens, rays, wavelength)
+    out = plain_trace(lens, rays, wavelength)
     # Rays that only a rim stops go on; others are returned on the axis and would give a wrong derivative.
     lost = (out.status != st.PASSED) & (out.rays.dz == -1.0) & (out.rays.x == 0.0)
     points = _plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
@@ -333,8 +332,7 @@ def relative_illumination(
     for r in radii:
         rays = FilmRays(torch.full_like(film_z, r), torch.zeros_like(film_z), film_z, *sample.columns()[3:])
         start = camera_rays(rays.film_x, rays.film_y, film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
-        with torch.no_grad():
-            traced = trace(stopped, start, rays.wavelength_nm, transmittance=True)
+        traced = plain_trace(stopped, start, rays.wavelength_nm, transmittance=True)
         for values, out in zip(sums, (traced, predict(rays, radius)), strict=True):
             power = torch.where(out.status == st.PASSED, out.transmittance.to(torch.float64), 0.0)
             values.append(float((power * start.dz**4).sum()))  # one film plane and pupil plane: Z is the same for all

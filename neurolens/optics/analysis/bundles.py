@@ -22,7 +22,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.analysis.fields import ChiefRays, Scene, on_plane
 from neurolens.optics.setting.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.optics.trace.aiming import without_rims
-from neurolens.optics.trace.rays import optical_path, trace
+from neurolens.optics.trace.rays import optical_path, plain_trace
 from neurolens.optics.trace.surfaces import Rays
 
 # The outermost ring lies this share inside the stop's edge, so that rounding never clips it.
@@ -179,8 +179,7 @@ class Aim:
         (u, v), h = uv, self.step_mm
         three = rows.repeat(3)
         rays = self.rays(torch.cat([u, u + h, u]), torch.cat([v, v, v + h]), three)
-        with torch.no_grad():
-            out = trace(self.front, rays, self.wavelength[three], towards="film")
+        out = plain_trace(self.front, rays, self.wavelength[three], towards="film")
         # The stop is the last surface of this lens: rays end on it.
         x, y = (c.reshape(3, -1) / self.stop_mm for c in out.rays[:2])
         t, s = (x, y) if self.along_x else (y, x)
@@ -326,8 +325,7 @@ class Filled:
 
     def _passes(self, u: Tensor, v: Tensor) -> Tensor:
         aim = self._aim(u.shape[1])
-        with torch.no_grad():
-            out = trace(self.lens, aim.rays(u.reshape(-1), v.reshape(-1)), aim.wavelength, towards="film")
+        out = plain_trace(self.lens, aim.rays(u.reshape(-1), v.reshape(-1)), aim.wavelength, towards="film")
         return ((out.status == 0) & aim.exists).reshape(u.shape)
 
 
@@ -346,8 +344,7 @@ def _traced(
 ) -> Bundle:  # fmt: skip
     """Trace the rays at places (u, v) of an aim to the film."""
     start = aim.rays(*at)
-    with torch.no_grad():
-        out = trace(scene.traced, start, aim.wavelength, towards="film", path=path)
+    out = plain_trace(scene.traced, start, aim.wavelength, towards="film", path=path)
     film, status = on_plane(out.rays, scene.film_z_mm), torch.where(aimed, out.status, st.blocked(0, st.MISSED))
     length = optical_path(scene.traced, [start, *out.path, film], aim.wavelength) if path else math.nan
 

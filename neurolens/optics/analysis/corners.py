@@ -23,7 +23,7 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.copies import Tolerances, draws_of
 from neurolens.optics.setting.pupils import camera_rays, pupil_bounds
 from neurolens.optics.trace.arrays import follow
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.optics.trace.surfaces import Rays
 
 PER_MM = (20.0, 40.0)
@@ -120,8 +120,7 @@ class Corners:
         """Return what surfaces and glass let through [P, R] in the lens as designed, which a copy hardly changes."""
         rays = Rays(*map(torch.from_numpy, self._rays(self.scene.film_z_mm)))
         waves = torch.from_numpy(np.tile(self._waves, len(self.picture_mm)))
-        with torch.no_grad():
-            found = trace(self.scene.lens, rays, waves, transmittance=True).transmittance
+        found = plain_trace(self.scene.lens, rays, waves, transmittance=True).transmittance
         return np.asarray(found).reshape(self._pupil.shape[1:])
 
     def _ends(self, lens: Lens, moved_mm: Array | float = 0.0) -> Spot:

@@ -24,7 +24,7 @@ from neurolens.optics.lens.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import image_radius_mm, on_plane
 from neurolens.optics.trace.aiming import Axis, aim_at_stop, between, bracket, from_stop, without_rims
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.optics.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
@@ -165,8 +165,7 @@ class Scene:
 
     def _from(self, start: Rays, exists: Tensor, nm: float) -> ChiefRays:
         """Trace chief rays from before the front surface to the film."""
-        with torch.no_grad():
-            out = trace(without_rims(self.lens), start, nm, towards="film")
+        out = plain_trace(without_rims(self.lens), start, nm, towards="film")
         exists = exists & (out.status == 0)
         film = on_plane(out.rays, self.film_z_mm)
         height, _ = self.image_axes(film.x, film.y)

@@ -15,7 +15,7 @@ from neurolens.optics.analysis.bundles import Pattern, bundle, fan
 from neurolens.optics.analysis.fields import Array, Scene
 from neurolens.optics.analysis.plots import FAINT, FIELD_COLOURS, INK, drawing
 from neurolens.optics.lens.prescription import Surface
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.optics.trace.shapes import sag_mm
 from neurolens.optics.trace.surfaces import Rays
 
@@ -150,8 +150,7 @@ def _fan_lines(scene: Scene, field: float) -> list[Array]:
     places = torch.linspace(0.01, 0.99, RAYS_A_FIELD, dtype=torch.float64) * (len(passing) - 1)
     chosen = passing[places.round().long()]
     start = Rays(*(c[0, 0][chosen] for c in rays.start))
-    with torch.no_grad():
-        path = trace(scene.lens, start, towards="film", path=True).path
+    path = plain_trace(scene.lens, start, towards="film", path=True).path
     film = Rays(*(c[0, 0][chosen] for c in rays.film))
     # From a plane in front of all surfaces; for a fisheye, from the same distance.
     reach = 4 * max(d for d in scene.lens.semi_diameters_mm if math.isfinite(d))

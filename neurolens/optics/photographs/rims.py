@@ -29,7 +29,7 @@ from neurolens.optics.setting.pupils import camera_rays, rear_opening_mm
 from neurolens.optics.setting.rims import narrowed_rims
 from neurolens.optics.setting.states import at_infinity, set_lens
 from neurolens.optics.trace.aiming import without_rims
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 
 Array = NDArray[np.float64]
 
@@ -151,8 +151,7 @@ def _traced(lens: Lens, film: float, plane: float, height_mm: Array, u: Array, v
     x = np.broadcast_to(height_mm[:, None, None], shape)
     flat = [torch.from_numpy(np.ascontiguousarray(a).reshape(-1)) for a in (x, np.zeros(shape), u, v)]
     rays = camera_rays(flat[0], flat[1], film, flat[2], flat[3], plane)
-    with torch.no_grad():
-        out = trace(lens, rays, LINE_D_NM, record=range(len(lens.surfaces)))
+    out = plain_trace(lens, rays, LINE_D_NM, record=range(len(lens.surfaces)))
     radius = np.empty((len(lens.surfaces), *shape))
     dead = torch.zeros(rays.x.shape, dtype=torch.bool)
     for k in range(len(lens.surfaces))[::-1]:

@@ -22,7 +22,7 @@ from neurolens.optics.setting.rims import end_mm
 from neurolens.optics.setting.states import in_state
 from neurolens.optics.trace.aiming import aim_at_stop
 from neurolens.optics.trace.arrays import follow
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.optics.trace.shapes import sag_mm
 from neurolens.optics.trace.surfaces import Rays
 
@@ -182,8 +182,7 @@ def _field(lens: Lens) -> Iterator[Check]:
 def _through(lens: Lens, field: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
     """Return whether rays of fields [F] to heights [F, H] in the stop exist, and their status [F * H]."""
     bundle = aim_at_stop(lens, field, heights)
-    with torch.no_grad():
-        return bundle.reached.reshape(-1), trace(lens, bundle.rays, towards="film").status
+    return bundle.reached.reshape(-1), plain_trace(lens, bundle.rays, towards="film").status
 
 
 def _blur(lens: Lens, data: FirstOrder) -> Check:
@@ -221,8 +220,7 @@ def axial_beam(lens: Lens) -> tuple[float, int | None]:
     zero, blocker = torch.zeros(_FAN, dtype=torch.float64), None
     for _ in range(3):
         y = torch.linspace(low, high, _FAN, dtype=torch.float64)
-        with torch.no_grad():
-            status = trace(lens, Rays(zero, y, zero - reach, zero, zero, zero + 1), towards="film").status
+        status = plain_trace(lens, Rays(zero, y, zero - reach, zero, zero, zero + 1), towards="film").status
         passed = int((status == st.PASSED).to(torch.int8).cumprod(0).sum())
         if passed == _FAN:
             return float(y[-1]), blocker
@@ -254,8 +252,7 @@ def film_edge_mm(lens: Lens) -> float | None:
         return None
     field = torch.tensor([math.radians(lens.half_field_deg)], dtype=torch.float64)
     bundle = aim_at_stop(lens, field, torch.zeros(1, 1, dtype=torch.float64))
-    with torch.no_grad():
-        out = trace(lens, bundle.rays, towards="film")
+    out = plain_trace(lens, bundle.rays, towards="film")
     if int(out.status[0]) == st.PASSED and bool(bundle.reached[0, 0]):
         return abs(float(on_plane(out.rays, first_order(lens).rear_focal_z_mm).x))
     wide = lens.half_field_deg >= 60

@@ -289,7 +289,7 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
     import torch  # only rays need it; rims are narrowed without
 
     from neurolens.optics.trace.aiming import aim_at_stop, without_rims
-    from neurolens.optics.trace.rays import trace
+    from neurolens.optics.trace.rays import plain_trace
 
     share = torch.linspace(0, 1, _FIELDS, dtype=torch.float64)
     kept = lens.stop_radius_mm * (1 - (1 - rule.vignetting) * share)
@@ -302,8 +302,7 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
             expected = "a field whose chief ray meets the middle of the stop: none does (a wrong radius or thickness?)"
         raise InputError(lens.path, "half_field_deg", field_deg, expected)
     every = range(len(lens.surfaces))
-    with torch.no_grad():
-        traced = trace(without_rims(lens), bundle.rays, towards="film", record=every)
+    traced = plain_trace(without_rims(lens), bundle.rays, towards="film", record=every)
     usable = bundle.reached & (traced.status == 0).reshape(heights.shape)
     at = torch.stack([traced.crossings[k].x.abs().reshape(heights.shape).where(usable, 0.0) for k in every])
     return at[:, 0].amax(1).tolist(), at[:, 1:].amax((1, 2)).tolist()

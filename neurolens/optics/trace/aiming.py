@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.trace.rays import trace
+from neurolens.optics.trace.rays import plain_trace
 from neurolens.optics.trace.shapes import followed_mm, sag_mm
 from neurolens.optics.trace.surfaces import Rays
 
@@ -159,8 +159,7 @@ def from_stop(
     x, zero = h - across, torch.zeros_like(h)
     start_z = z + sag.repeat_interleave(angle.shape[1]) - along
     start = Rays(x, zero, start_z, across, zero, along) if axis == "x" else Rays(zero, x, start_z, zero, across, along)
-    with torch.no_grad():
-        out = trace(front, start, wavelength_nm)
+    out = plain_trace(front, start, wavelength_nm)
     r = out.rays
     field = torch.atan2(r.dx if axis == "x" else r.dy, -r.dz)
     # The rays are reversed and moved back, so that the front surface is still ahead of them.

@@ -5,7 +5,6 @@ status and stays finite. `follow` traces ghosts: they meet the same surfaces wit
 """
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -16,13 +15,12 @@ from torch.autograd import forward_ad
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.files import cache_folder
 from neurolens.base.tasks import keep_memory
 from neurolens.optics.lens import glass
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.trace.arithmetic import is_number, times
 from neurolens.optics.trace.films import TensorPassage
-from neurolens.optics.trace.shapes import centred, is_deep, start_of, traced_curve
+from neurolens.optics.trace.shapes import is_deep, traced_curve
 from neurolens.optics.trace.surfaces import (
     UNIT_SLACK,
     Hit,
@@ -131,6 +129,9 @@ def trace(
     return _joined(parts)
 
 
+plain_trace = torch.no_grad()(trace)  # without derivatives, for those who only read off where rays go
+
+
 def optical_path(
     lens: Lens, points: Sequence[Rays], wavelength_nm: Tensor | float, towards: Towards = "film"
 ) -> Tensor:
@@ -181,25 +182,6 @@ def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Toward
     passed = torch.zeros(len(rays.x), dtype=torch.bool)
     passed[left] = tracing.tests.passed > 0
     return passed
-
-
-def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph: bool = False) -> Callable[..., Any]:
-    """Compile a function that traces rays through a lens with torch, with the prescription folded in as constants.
-
-    Every new number of rays compiles anew, so call the result with batches of one length. Without a C++ compiler the
-    first call raises torch's own error; `trace` itself needs none.
-
-    What the compiler may take for constant is marked in here and not at import, because marking imports the compiler,
-    which takes longer than a camera needs to start. Torch keeps the machine code that it makes, and runs what it finds:
-    by default in a folder that every user of the machine can create. So its cache is moved into the user's own folder.
-    """
-    for surface in lens.surfaces if lens else ():  # read the catalogue now: compiled code cannot read files
-        glass.index_of(surface, glass.LINE_D_NM)
-    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache_folder("torch"))
-    for constant in (start_of, centred):
-        torch.compiler.assume_constant_result(constant)
-    return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 
 
 def _differentiated(value: Any) -> bool:

@@ -12,11 +12,12 @@ from shipped import backwards, focused, rays, whole
 from torch import Tensor
 
 from experiments.accuracy.extreme_cases import from_film, generator
+from experiments.peers.rays import compile_tracing
 from neurolens.base import status as st
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.setting.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.optics.trace.rays import CHUNK, Rays, Towards, compile_tracing, passing, trace
+from neurolens.optics.trace.rays import CHUNK, Rays, Towards, passing, trace
 
 INF = math.inf
 WIDE = 1000.0
