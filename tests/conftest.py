@@ -77,8 +77,8 @@ def quick_races() -> Iterator[None]:
         patch.setattr(compiler, "_KEPT", 4096)
         patch.setattr("neurolens.cameras.exact._KEPT", 4096)
         patch.setattr("neurolens.models.pairs._BATCH", 16384)  # fits here take a few thousand rays
-        patch.setattr("neurolens.studies.speed.CompiledSource.__init__.__defaults__", (flags, False, ()))
-        patch.setattr("neurolens.studies.speed.program_candidate.__defaults__", (None, flags, False))
+        patch.setattr("experiments.speed.compiled_source.CompiledSource.__init__.__defaults__", (flags, False, ()))
+        patch.setattr("experiments.speed.compiled_source.program_candidate.__defaults__", (None, flags, False))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
         patch.setattr("neurolens.studies.speed.POOL", 16384)
         patch.setattr("neurolens.studies.speed._SAMPLES", 1)

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from experiments import lab
+from experiments.speed.compiled_source import CompiledSource
 from neurolens.models.copied import Perturbed, copy_of
 from neurolens.models.cores import DIRECTION, STOP
 from neurolens.models.file import as_stored, read_model
@@ -35,7 +36,6 @@ from neurolens.optics.setting.copies import Off, Tolerances, draws_of
 from neurolens.optics.setting.focusing import best_focus_z_mm
 from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.trace.rays import trace
-from neurolens.studies.speed import CompiledSource
 
 MODELS = (
     "brendel_tessar_100.ols-64", "canon_ef_85mm_f1_8_usm.ols-64", "laikin_double_gauss_50.ols-60",

@@ -30,6 +30,7 @@ import torch
 
 from experiments import lab
 from experiments.languages import RUN, Given, Missing, Rows
+from experiments.speed.compiled_source import CompiledSource
 from neurolens.base import status as st
 from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.build import make_camera
@@ -44,7 +45,6 @@ from neurolens.optics.lens.shot import Shot
 from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.trace.filmfit import FIT
 from neurolens.optics.trace.rays import trace
-from neurolens.studies.speed import CompiledSource
 
 LENS, MODEL = "laikin_double_gauss_50", "laikin_double_gauss_50.ols-36.onnx"
 CHUNK = 1 << 17  # rays of one film plane and stop

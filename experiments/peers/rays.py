@@ -43,6 +43,7 @@ import torch
 
 from experiments import lab
 from experiments.peers.ray_peers import ABSENT, PEERS, WAVELENGTH_NM, Found, Peer, Prepared, Task, table_of
+from experiments.speed.compiled_source import CompiledSource
 from experiments.speed.tracer_race import has_avx512
 from neurolens.base.files import cache_folder
 from neurolens.cameras.model import load_model
@@ -64,7 +65,7 @@ from neurolens.optics.trace.rays import trace
 from neurolens.optics.trace.shapes import centred, start_of
 from neurolens.optics.trace.tracegraph import exact_graph
 from neurolens.studies.plots import place_labels
-from neurolens.studies.speed import CompiledSource, Unavailable
+from neurolens.studies.speed import Unavailable
 
 COUNT, SEED, LEAST_S = 100_000, 36, 0.004  # rays, their seed, and the least time of a sample
 CASES = {  # lens: its models

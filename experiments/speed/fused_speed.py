@@ -20,6 +20,7 @@ import numpy as np
 
 from experiments import lab
 from experiments.lab import Report, Row
+from experiments.speed.compiled_source import program_candidate
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxlens import open_session
 from neurolens.graph.compiler import FLAGS, find_compiler
@@ -36,7 +37,7 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.tracegraph import exact_graph
 from neurolens.studies.experiment import LensChoice
 from neurolens.studies.rays import ray_errors
-from neurolens.studies.speed import Call, Candidate, model_candidate, program_candidate
+from neurolens.studies.speed import Call, Candidate, model_candidate
 
 WITHIN_UM = 1.0
 AVX2 = (*FLAGS, "-mno-avx512f")  # what is not fixed is compiled a second time, without AVX-512

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from experiments.speed.compiled_source import CompiledSource, program_candidate
 from experiments.speed.fused_speed import Case
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.scalars import lower
@@ -35,7 +36,7 @@ from neurolens.optics.lens.figures import SPHERE
 from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, cauchy, index_of
 from neurolens.optics.lens.prescription import Lens, Medium, Surface
 from neurolens.optics.trace.tracegraph import exact_graph
-from neurolens.studies.speed import FUSED_BATCHES, Call, Candidate, CompiledSource, Unavailable, program_candidate
+from neurolens.studies.speed import FUSED_BATCHES, Call, Candidate, Unavailable
 
 REFERENCE = lab.ROOT.parent / "shared" / "data" / "reference_tracer"
 CASES = (

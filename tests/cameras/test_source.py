@@ -16,6 +16,7 @@ from command_line import failure
 from numpy.typing import ArrayLike, NDArray
 from shipped import whole
 
+from experiments.speed.compiled_source import CompiledSource
 from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
@@ -37,7 +38,6 @@ from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.setting.states import set_lens
 from neurolens.optics.trace.rays import trace
 from neurolens.optics.trace.surfaces import Rays
-from neurolens.studies.speed import CompiledSource
 
 ROOT = Path(__file__).parents[2]
 LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"

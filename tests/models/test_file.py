@@ -22,6 +22,7 @@ from onnx import helper
 from shipped import SOME
 from writers import compiled, rays_of, written_rays
 
+from experiments.speed.compiled_source import CompiledSource
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.onnxlens import OnnxLens, load_model
@@ -39,7 +40,6 @@ from neurolens.models.source import Fix, at_wavelength, export_source, fixed_mod
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
-from neurolens.studies.speed import CompiledSource
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted(f for f in (ROOT / "models").glob("*.onnx") if f.name.partition(".")[0].partition("-")[0] in SOME)

@@ -11,6 +11,7 @@ import onnxruntime
 import pytest
 import torch
 
+from experiments.speed.compiled_source import CompiledSource
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
@@ -29,7 +30,6 @@ from neurolens.models.targets import film_equivalent
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.setting.copies import Off, Tolerances, draws_of, figure_names, perturbed
 from neurolens.optics.setting.states import set_lens
-from neurolens.studies.speed import CompiledSource
 
 MODELS = Path(__file__).parents[2] / "models"
 FILE = MODELS / "laikin_double_gauss_50.ols-60.onnx"

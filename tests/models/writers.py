@@ -14,6 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from experiments.speed.compiled_source import CompiledSource
 from neurolens.base.errors import InputError
 from neurolens.graph.c import Signature, literal
 from neurolens.graph.compiler import find_compiler
@@ -23,7 +24,6 @@ from neurolens.models.fitted import FilmRays
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import sample_domain
 from neurolens.models.source import fused_program
-from neurolens.studies.speed import CompiledSource
 
 COLUMNS = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
 Rows = dict[str, NDArray[np.float32]]  # by name, as `Program.evaluate` takes and gives them
