@@ -18,9 +18,10 @@ from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import make_camera
 from neurolens.optics.lens.shot import Shot
+from neurolens.pictures.render.colour import linear_to_srgb
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import load_scene
-from neurolens.studies.scenes import Image, to_srgb
+from neurolens.studies.scenes import Image
 
 SCENE = lab.SCENES / "chess.toml"
 _GAP = 6  # pixels between the pictures
@@ -75,7 +76,9 @@ def run(args: argparse.Namespace) -> None:
     shown = []
     for lens, picture in zip(LENSES, pictures, strict=True):
         exposure = float(np.median(pictures[0][middle]) / np.median(picture[middle]))
-        shown.append(lab.labelled(Pictures.fromarray(np.uint8(np.round(255 * to_srgb(picture, exposure)))), lens.title))
+        shown.append(
+            lab.labelled(Pictures.fromarray(np.uint8(np.round(255 * linear_to_srgb(exposure * picture)))), lens.title)
+        )
     args.out.mkdir(parents=True, exist_ok=True)
     forms = [(lab.sheet(shown, 2, _GAP), {"quality": quality}) for quality in (90, 80, 70)]
     lab.write_small(args.out / "night.jpg", forms, _MOST_BYTES)

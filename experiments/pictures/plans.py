@@ -15,6 +15,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from experiments.pictures import plan_errors
 from neurolens.base.progress import Report
 from neurolens.cameras.build import ideal_as, make_camera
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.field import Field, field_of
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.reduced import Warped
 from neurolens.models.terms import pinned_threads
@@ -239,7 +241,23 @@ def camera_of(choice: choices.Choice, probed: Probe, state: str | None, smooth: 
     if "ST map" not in choice.name:
         return make_camera(choice.camera, replace(shot, zoom=state))
     flat = ideal_as(f"{choice.name.partition(' ')[0]}:", probed.exact.lens, Shot(own.film_mm, own.focus_m))
-    return Warped(flat, probed.exact, own.focus_m, tables=smooth)
+    return (WarpedByTables if smooth else Warped)(flat, probed.exact, own.focus_m)
+
+
+class WarpedByTables(Warped):
+    """A warped camera with tables of both fields, which take seconds and then serve the points of a whole picture."""
+
+    def __init__(self, flat: Camera, camera: Camera, focus_m: float) -> None:
+        self._fields: dict[int, Field] = {}
+        super().__init__(flat, camera, focus_m)
+        wide = copy(flat)
+        wide.film_mm = tuple(map(float, self.sides * self.film_mm))
+        self._fields = {id(camera): field_of(camera, focus_m), id(flat): field_of(wide, focus_m)}
+
+    def _place_and_light(self, camera: Camera, point: Any) -> tuple[Any, Any]:
+        if field := self._fields.get(id(camera)):
+            return field.ideal(point), field.relative_light(point)
+        return super()._place_and_light(camera, point)
 
 
 def _thin(probed: Probe) -> Camera:

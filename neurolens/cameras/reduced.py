@@ -22,7 +22,6 @@ on rings about the axis, which are closer to each other towards the end of the l
 """
 
 import math
-from copy import copy
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -38,9 +37,7 @@ from neurolens.cameras.field import (
     RECTILINEAR,
     WIDEST_DEG,
     Complex,
-    Field,
     end_of_light,
-    field_of,
     film_edge,
     frame_of,
     on_axis,
@@ -382,21 +379,22 @@ class Warped:
         flat: pinhole, thin or thick lens, with the same film.
         camera: the one to be shown.
         focus_m: from the film to the plane that the maps are of.
-        tables: True makes tables of both fields, which takes seconds; a `Field` is the camera's own, made before. With
-            False film points are traced.
+
+    Attributes:
+        sides: width and height of the picture before it is warped, over those of the film. area: of that picture, over
+            the film's.
 
     Raises:
         InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
     """
 
-    def __init__(self, flat: Camera, camera: Camera, focus_m: float, tables: bool | Field = False) -> None:
+    def __init__(self, flat: Camera, camera: Camera, focus_m: float) -> None:
         self.name, self.film_mm, self.settings = f"{flat.name}, warped", flat.film_mm, flat.settings
         self.wavelength_nm, self.dispersive = flat.wavelength_nm, flat.dispersive
         self.achromatic = getattr(flat, "achromatic", False)
         self._flat, self._focus_m = flat, focus_m
         self._frames = {id(c): frame_of(c) for c in (flat, camera)}
         self._shown = camera
-        self._fields: dict[int, Field] = {}
         self._axis = {id(c): self._traced(c, on_axis(c))[1][0] for c in (flat, camera)}
         near, own, frame = 1e-3 / focus_m, self._frames[id(flat)], self._frames[id(camera)]
         # Sizes of things in focus, of the one over the other: 1, except in the second meridian of a lens with
@@ -413,19 +411,12 @@ class Warped:
             raise InputError(camera.name, "film_mm", self.film_mm, expected)
         before = self._before(ideal)
         # The picture reaches beyond the film's edge, too, which distortion moves farther out than points within it.
-        sides = 2 * BEYOND**2 * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
-        self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
-        if tables:
-            wide = copy(flat)
-            wide.film_mm = float(sides[0] * self.film_mm[0]), float(sides[1] * self.film_mm[1])
-            shown = tables if isinstance(tables, Field) else field_of(camera, focus_m)
-            self._fields = {id(camera): shown, id(flat): field_of(wide, focus_m)}
+        self.sides = 2 * BEYOND**2 * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
+        self.area = float(np.maximum(self.sides, 1.0).prod())
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Return rays for film points [2, N] in mm, as the ideal camera has them."""
-        each, back = -(film_mm[0] + 1j * film_mm[1]).astype(np.complex128), np.arange(film_mm.shape[1])
-        if not self._fields:
-            each, back = np.unique(each, return_inverse=True)
+        each, back = np.unique(-(film_mm[0] + 1j * film_mm[1]).astype(np.complex128), return_inverse=True)
         ideal, light = self._place_and_light(self._shown, each)
         place = self._before(ideal)
         flat = self._place_and_light(self._flat, place)[1]
@@ -436,8 +427,6 @@ class Warped:
 
     def _place_and_light(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
         """Return the undistorted places of picture points, and their light over that on the axis."""
-        if field := self._fields.get(id(camera)):
-            return field.ideal(point), field.relative_light(point)
         ideal, light = self._traced(camera, point)
         return ideal, light / self._axis[id(camera)]
 

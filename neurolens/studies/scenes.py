@@ -27,7 +27,7 @@ from neurolens.optics.analysis.plots import drawing, plain_log_ticks
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
-from neurolens.pictures.render.colour import SpectralRange
+from neurolens.pictures.render.colour import SpectralRange, linear_to_srgb
 from neurolens.pictures.render.job import camera_axes
 from neurolens.pictures.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.pictures.render.primitives import Rays
@@ -71,12 +71,6 @@ def _checked_pair(test: ArrayLike, reference: ArrayLike) -> tuple[Image, Image]:
     return a, b
 
 
-def to_srgb(linear: ArrayLike, exposure: float = 1.0) -> Image:
-    """Return linear RGB times `exposure`, clipped to [0, 1], through the sRGB curve (IEC 61966-2-1). Any shape."""
-    c = np.clip(np.asarray(linear, dtype=np.float64) * exposure, 0.0, 1.0)
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
-
-
 def rel_mse(test: ArrayLike, reference: ArrayLike) -> float:
     """Return the relative mean squared error of linear radiance: the mean of (a - b)^2 / (b^2 + eps).
 
@@ -96,7 +90,7 @@ def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
     """Return LDR-FLIP for each pixel, [H, W] in [0, 1]: what an observer sees when flipping between the two pictures.
 
     Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", through their `flip-evaluator`.
-    Linear RGB goes through `to_srgb`; the viewing distance is that of `PIXELS_PER_DEGREE`.
+    Linear RGB goes through `linear_to_srgb`; the viewing distance is that of `PIXELS_PER_DEGREE`.
 
     Raises:
         InputError: as `rel_mse`.
@@ -107,7 +101,7 @@ def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
         import flip_evaluator
     except ImportError as error:
         raise NeurolensError(f"FLIP needs flip-evaluator: {pip_install('train')}") from error
-    pictures = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (b, a))
+    pictures = (np.ascontiguousarray(linear_to_srgb(x)) for x in (b, a))
     options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
     errors, _, _ = flip_evaluator.evaluate(*pictures, "LDR", **options)
     return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
@@ -184,7 +178,7 @@ def side_by_side(
     """Draw renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
 
     Args:
-        images: linear RGB [H, W, 3] by name, shown through `to_srgb`; all of one shape.
+        images: linear RGB [H, W, 3] by name, shown through `linear_to_srgb`; all of one shape.
         error_maps: errors [H, W] by name; a name without one (the reference) keeps its place below for its caption. All
             share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
         path: PNG, PDF or SVG to write.
@@ -207,7 +201,7 @@ def side_by_side(
             axes.set_axis_off()
         for k, (name, picture) in enumerate(pictures.items()):
             above, below = (grid[k // columns * each + i, k % columns] for i in (0, each - 1))
-            above.imshow(to_srgb(picture), interpolation="nearest")
+            above.imshow(linear_to_srgb(picture), interpolation="nearest")
             above.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
             if name in maps:
                 look = {"cmap": "magma", "norm": log_norm(low, high), "interpolation": "nearest"}

@@ -8,7 +8,6 @@ on where it stopped. A page that sorts and filters by itself, CSV and JSON show 
 import json
 import math
 import time
-import traceback
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -41,7 +40,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
 from neurolens.base.report import Report, csv_text
 from neurolens.base.settings import LIGHT_NM
-from neurolens.base.tasks import Failed, run_each
+from neurolens.base.tasks import Failed, failure, run_each
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import ModelSettings, prepare
 from neurolens.models.fitted import Domain
@@ -130,7 +129,8 @@ def run_task(task: Task) -> bytes:
             _survey(task, _put(place / "lens", task.name, task.data), record)
         except Exception as error:
             record["verdict"] = record["verdict"] if isinstance(error, NeurolensError) else "fault"
-            record["reason"] = _reason(error).replace(f"{place}/lens/", "").replace(f"{place}/glass/", "")
+            said = failure(error).reason.replace(f"{place}/lens/", "").replace(f"{place}/glass/", "")
+            record["reason"] = one_line(said, _REASON)
     return json.dumps(plain(record), sort_keys=True, allow_nan=False).encode()
 
 
@@ -150,13 +150,6 @@ def _put(folder: Path, name: str, data: bytes) -> Path:
     file = folder / (PurePosixPath(name).name or "lens")
     file.write_bytes(data)
     return file
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, NeurolensError):
-        return one_line(str(error), _REASON)
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return one_line(f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})", _REASON)
 
 
 def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:

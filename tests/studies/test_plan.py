@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from shipped import whole
 
+from experiments.pictures.plans import WarpedByTables
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import resolve
 from neurolens.base.tomlfile import format_toml
@@ -179,7 +180,7 @@ def test_a_warped_picture_has_the_lens_s_light_in_its_corners() -> None:
     """The corners of a film of 16 to 9, which the distortion moves beyond what is seen within them."""
     shot = Shot((36.0, 20.25), 2.0, f_number=2.0)
     exact, flat = make_camera(GAUSS, shot), make_camera(f"thick:{GAUSS}", shot)
-    warped = Warped(flat, exact, 2.0, tables=True)
+    warped = WarpedByTables(flat, exact, 2.0)
     square = np.random.default_rng(0).random((2, 20_000), np.float32)
     waves = np.linspace(420, 680, 20_000, dtype=np.float32)
     for x, y in ((17.97, 10.1), (-17.99, 10.12), (17.9, -10.0)):

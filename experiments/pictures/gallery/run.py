@@ -41,10 +41,11 @@ from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import versions
 from neurolens.optics.analysis.plots import new_figure, style
+from neurolens.pictures.render.colour import linear_to_srgb
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import load_scene
 from neurolens.studies.plots import rounded_up
-from neurolens.studies.scenes import Image, to_srgb
+from neurolens.studies.scenes import Image
 
 SCHEMA = 1
 _CAMERAS = 2  # counts changes of what a column's camera is: figures of earlier ones are made again
@@ -347,7 +348,7 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
                 if difference is not None:
                     shown = axes.imshow(100 * difference, cmap="magma", vmin=0, vmax=100 * scale, **look)
                 else:
-                    axes.imshow(to_srgb(lab.denoised(row.pictures[column]), row.exposure), **look)
+                    axes.imshow(linear_to_srgb(row.exposure * lab.denoised(row.pictures[column])), **look)
                 _axes(axes, first=k == 0)
                 if k == 0:
                     axes.set_title(row.label, loc="left", fontsize=10.5, pad=3)
