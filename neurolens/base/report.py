@@ -14,16 +14,17 @@ writes falloff.csv, with a row of what is said once, and falloff.field-wavelengt
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from neurolens.base.errors import printable
 from neurolens.base.files import atomic_write_text
 from neurolens.base.records import plain
 from neurolens.base.settings import without_unit
 
+T = TypeVar("T")
 Rows = list[dict[str, Any]]  # of a table, by the names of its columns
 
 
@@ -160,6 +161,12 @@ def _spread(axes: tuple[str, ...], values: Any, sides: Mapping[str, int]) -> Any
         values = np.pad(values, missing, constant_values=np.nan)
     shape = [sides[axis] if axis in axes else 1 for axis in sides]
     return np.broadcast_to(values.reshape(shape), tuple(sides.values()))
+
+
+def some_of(items: Sequence[T], most: int) -> list[T]:
+    """Return at most so many of some items (2 or more), evenly spread, with both ends among them."""
+    steps = min(most, len(items)) - 1
+    return [items[round(k * (len(items) - 1) / steps)] for k in range(steps + 1)] if steps > 0 else list(items)
 
 
 def write_tables(folder: Path, answer: Any, name: str) -> None:

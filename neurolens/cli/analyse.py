@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from neurolens.base.errors import InputError, warned
-from neurolens.base.report import PART, Report
+from neurolens.base.report import PART, Report, some_of
 from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavelengths_nm, whole
 from neurolens.cli import arguments as cli
 from neurolens.optics.setting.copies import Tolerances
@@ -286,7 +286,7 @@ def _fans_text(found: Fans) -> str:
 
 
 def _colour_text(found: Colour) -> str:
-    some = _some(len(found.spectrum_nm), 9)
+    some = some_of(range(len(found.spectrum_nm)), 9)
     zones = ("paraxial", *(f"zone {z:.2f}" for z in found.zone[1:]))
     first = [(f"{found.spectrum_nm[i]:.0f} nm", *_each(_three, found.focus_shift_mm[i])) for i in some]
     head = "Lateral colour (height from that of the first line, µm)"
@@ -385,22 +385,16 @@ def _each(form: Callable[..., Any], *values: Iterable[Any]) -> list[Any]:
 
 def _over_field(head: str, found: Any, columns: Sequence[tuple[str, list[str]]], every: bool = False) -> str:
     """Return a table with a row for some fields, or for `every` one: its angle, its height, then the cells."""
-    count = len(found.field_deg)
+    places = range(len(found.field_deg))
     angles = ["axis" if field == 0 else f"{field:.2f}°" for field in found.field_deg]
     heights = [("height mm", _each(partial(_fixed, places=2), found.height_mm))] if hasattr(found, "height_mm") else []
     shown = [*heights, *columns]
-    rows = [(angles[i], *(cells[i] for _, cells in shown)) for i in (range(count) if every else _some(count))]
+    rows = [(angles[i], *(cells[i] for _, cells in shown)) for i in (places if every else some_of(places, _ROWS))]
     return f"{head}\n{cli.table(('field', *(heading for heading, _ in shown)), rows)}"
 
 
 def _nanometres(waves: Iterable[float]) -> list[str]:
     return [f"{nm:.0f} nm" for nm in waves]
-
-
-def _some(count: int, rows: int = _ROWS) -> list[int]:
-    """Return about so many of the indices below `count`, evenly spread, with both ends among them."""
-    steps = min(rows, count) - 1
-    return [round(k * (count - 1) / steps) for k in range(steps + 1)] if steps > 0 else [0] * count
 
 
 def _digits(spread: float) -> int:

@@ -13,7 +13,7 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
 from neurolens.base.progress import Progress
-from neurolens.base.report import PART, Report
+from neurolens.base.report import PART, Report, some_of
 from neurolens.base.settings import setting, setting_of
 from neurolens.cameras.contract import Camera
 from neurolens.cli import arguments as cli
@@ -194,13 +194,11 @@ class _Writer:
         command, states, found = self.command, self.command.states(), list[Any]()
         by_focal = dict(sorted((float(f"{p.focal_mm:.5g}"), k) for k, p in enumerate(self.shot.frames)))
         rows = list(by_focal.values())
-        chosen = sorted(
-            {round(n * (len(rows) - 1) / (standards.MOST_ENTRIES - 1)) for n in range(standards.MOST_ENTRIES)}
-        )
+        chosen = some_of(rows, standards.MOST_ENTRIES)
         red_blue = command.wavelengths[0], command.wavelengths[2]
         with progress.stage("fit lensfun's profile") as report:
-            for n in chosen:
-                frame, (_, state) = self.frames[rows[n]], states[rows[n]]
+            for row in chosen:
+                frame, (_, state) = self.frames[row], states[row]
                 plane_m = frame.focus_m if command.distance is None else command.distance
 
                 def at_stop(f_number: float | None, state: cli.LensState = state) -> Camera:

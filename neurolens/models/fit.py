@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from neurolens.base.errors import InputError
+from neurolens.base.report import some_of
 from neurolens.base.settings import LIGHT_NM
 from neurolens.models.axes import Array, Axis, product, weights
 from neurolens.models.boundaries import invariant_core
@@ -399,7 +400,7 @@ def fit_states(
         raise InputError("fit", "terms", settings.terms, f"from 2 to fewer than the {settings.rays} rays of a node")
     states = product(space.axes)
     with pinned_threads():
-        choosers = sorted({round(float(k)) for k in np.linspace(0, len(states) - 1, _CHOOSERS)})
+        choosers = some_of(range(len(states)), _CHOOSERS)
         chosen: dict[int, Prepared] = {}
         for done, k in enumerate(choosers):
             chosen[k] = prepare(_pairs(space, states[k], settings))

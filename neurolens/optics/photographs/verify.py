@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
-from neurolens.base.report import Report, over
+from neurolens.base.report import Report, over, some_of
 from neurolens.optics.analysis.field_curves import PROJECTIONS, RECTILINEAR
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.plots import FIELD_COLOURS, INK, drawing
@@ -298,12 +298,8 @@ def names_of(lens: Lens) -> list[str]:
     return [name for name in names if name]
 
 
-def found_for(
-    lens: Lens, wanted: str | None = None, *, any_focal: bool = False
-) -> tuple[Match, list[Profile], tuple[str, ...]]:
+def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profile], tuple[str, ...]]:
     """Find the profile for a lens, all profiles of that name, and the names of other likely ones.
-
-    With `any_focal` a profile need not have the table's focal length, for tables that are doubted.
 
     Raises:
         InputError: a lens with cylinders has two distortions; there is no profile, none of the name that is wanted, or
@@ -314,8 +310,7 @@ def found_for(
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     if wanted is not None:
         same = _by_film(profile_named(wanted), lens)
-        if not any_focal:
-            _check_focal_length(lens, same[0])
+        _check_focal_length(lens, same[0])
         return Match(same[0], 1.0), same, ()
     found = [m for m in matches(names_of(lens)) if m.certainty != "uncertain"]
     if not found:
@@ -326,8 +321,7 @@ def found_for(
     same = [m.profile for m in found if (m.profile.maker, m.profile.model) == (best.profile.maker, best.profile.model)]
     also = dict.fromkeys(m.profile.model for m in found if m.likeness == best.likeness and m.profile not in same)
     same = _by_film(same, lens)
-    if not any_focal:
-        _check_focal_length(lens, same[0])
+    _check_focal_length(lens, same[0])
     return best, same, tuple(also)
 
 
@@ -436,7 +430,7 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
             axes.grid(True)
             axes.set(xlabel="image height, mm", ylabel=label)
         bent = [(c.focal_mm, c.distortion_percent) for c in found.comparisons if c.distortion_percent is not None]
-        for colour, (focal, curve) in zip(FIELD_COLOURS, _some_of(bent), strict=False):
+        for colour, (focal, curve) in zip(FIELD_COLOURS, some_of(bent, _MOST), strict=False):
             _both(left, curve, colour, f"{focal:g} mm")
         for name, colour in (("red", "#d55e00"), ("blue", "#0072b2")):
             curves = ((c.focal_mm, getattr(c, f"{name}_um")) for c in found.comparisons)
@@ -445,7 +439,7 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
                 _both(middle, curve, colour, f"{name}, {focal:g} mm")
         lit = [c for c in found.comparisons if c.light_stops]
         if lit:
-            for colour, f_number in zip(FIELD_COLOURS, _some_of(sorted(lit[0].light_stops)), strict=False):
+            for colour, f_number in zip(FIELD_COLOURS, some_of(sorted(lit[0].light_stops), _MOST), strict=False):
                 _both(right, lit[0].light_stops[f_number], colour, f"f/{f_number:g}")
             right.set_title(f"{lit[0].focal_mm:g} mm", loc="right", fontsize=9, color=INK)
         for axes in (left, middle, right):
@@ -458,10 +452,3 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
 def _both(axes: Any, curve: Curve, colour: str, label: str) -> None:
     axes.plot(curve.height_mm, curve.computed, color=colour, label=label)
     axes.plot(curve.height_mm, curve.measured, "o", color=colour, markersize=3.5)
-
-
-def _some_of(items: list[Any]) -> list[Any]:
-    """Return at most `_MOST` items of a list, evenly spread, with both ends."""
-    if len(items) <= _MOST:
-        return items
-    return [items[round(k * (len(items) - 1) / (_MOST - 1))] for k in range(_MOST)]

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base.report import some_of
 from neurolens.base.settings import LIGHT_NM
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair
@@ -96,7 +97,7 @@ def grids_of(
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = entering(rays_across(tracer.lens, light, whole.places)[0])
     few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
-    nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
+    nodes = some_of(wavelengths_nm, _NODES)
     ghosts: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
     pairs = tracer.pairs if only is None else only
     for k in range(0, len(pairs), _AT_ONCE):
