@@ -29,6 +29,7 @@ from neurolens.cli import arguments as cli, command
 from neurolens.cli.calls import Answer, call, command_of, parameters, signature_of
 from neurolens.models.file import read_model
 from neurolens.optics.lens.shot import Shot
+from neurolens.optics.setting.states import focus_of, set_lens
 from neurolens.programs.hosts import rays
 
 if TYPE_CHECKING:
@@ -207,8 +208,6 @@ class Lens(_Chosen):
     @cached_property
     def prescription(self) -> Prescription:
         """The surfaces, gaps and glasses of the lens in this state."""
-        from neurolens.optics.setting.states import set_lens
-
         tabled = self._tabled
         with self._glasses():
             return set_lens(tabled, self._read.state.shot())
@@ -239,8 +238,6 @@ class Lens(_Chosen):
     @property
     def focus_m(self) -> float:
         """The distance from the film to the object in focus, or inf."""
-        from neurolens.optics.setting.states import focus_of
-
         lens = self.prescription
         with self._glasses():
             return focus_of(lens, self._read.state.shot())

@@ -20,7 +20,11 @@ from neurolens.cameras.reduced import ReducedDispersion, Vignetted
 from neurolens.cameras.sampling import beyond_circle
 from neurolens.graph.compiler import has_compiler
 from neurolens.models.card import read_card
+from neurolens.optics.lens.paraxial import first_order, framing_mm
 from neurolens.optics.lens.shot import BY_LENSES, Shot, film_size, film_within
+from neurolens.optics.setting.focusing import near_limit_m
+from neurolens.optics.setting.pupils import image_radius_mm
+from neurolens.optics.setting.states import focus_of, set_lens
 
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
@@ -55,11 +59,7 @@ def film_of(spec: str | Path, **size: Any) -> tuple[tuple[float, float], str]:
         return film_size("fullframe"), "fullframe"
     if is_model(path):
         return film_within(float(read_card(path)["domain"]["film_radius_mm"]))
-    from neurolens.optics.readers.any_format import read_any
-    from neurolens.optics.setting.pupils import image_radius_mm
-    from neurolens.optics.setting.states import set_lens
-
-    return film_within(image_radius_mm(set_lens(read_any(path), **size))[0])
+    return film_within(image_radius_mm(set_lens(_read(path), **size))[0])
 
 
 def near_of(spec: str | Path, **size: Any) -> float:
@@ -72,11 +72,13 @@ def near_of(spec: str | Path, **size: Any) -> float:
         return 14e-3 * float(size.get("focal_length_mm", _FOCAL_MM))
     if is_model(path):
         return min(map(float, read_card(path)["domain"]["focus_m"]))
-    from neurolens.optics.readers.any_format import read_any
-    from neurolens.optics.setting.focusing import near_limit_m
-    from neurolens.optics.setting.states import set_lens
+    return near_limit_m(set_lens(_read(path), **size))
 
-    return near_limit_m(set_lens(read_any(path), **size))
+
+def _read(path: Path) -> Lens:
+    from neurolens.optics.readers.any_format import read_any  # models and ideal cameras start without all the readers
+
+    return read_any(path)
 
 
 def as_c(camera: Camera) -> Camera:
@@ -117,12 +119,9 @@ def _ideal(kind: str, shot: Shot) -> Camera:
 
 
 def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
-    from neurolens.optics.readers.any_format import read_any
-    from neurolens.optics.setting.states import focus_of, set_lens
-
     given, shot = shot, shot.whole()
     shot.check_taken(f"{kind}{path}", {*BY_LENSES, *(ThinLens.takes if kind == "thin:" else ())})
-    lens = set_lens(read_any(path), replace(shot, focus_m=given.focus_m, aperture=None, film_offset_mm=0.0))
+    lens = set_lens(_read(path), replace(shot, focus_m=given.focus_m, aperture=None, film_offset_mm=0.0))
     shot = replace(shot, focus_m=focus_of(lens, given))
     camera = ideal_as(kind, lens, shot)
     of_lens = {name: value for name, value in shot.record(BY_LENSES).items() if name not in camera.settings}
@@ -141,8 +140,6 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
         InputError: a thick lens is asked of a lens with cylinders, which has two focal lengths; and what the cameras
             raise.
     """
-    from neurolens.optics.lens.paraxial import first_order, framing_mm
-
     if lens.anamorphic and kind == "thick:":
         raise InputError(
             lens.path, "surfaces", "(cylinders)", "a lens that is round about its axis: it has two focal lengths"
@@ -175,10 +172,8 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 
 def _exact(path: Path, shot: Shot, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
-    from neurolens.optics.readers.any_format import read_any
-    from neurolens.optics.setting.states import set_lens
 
-    tabled = read_any(path)
+    tabled = _read(path)
     camera = ExactCamera(tabled, shot, progress=progress)
     camera.settings["notes"] = [
         *_doubts(tabled),
@@ -198,8 +193,6 @@ def _doubts(lens: Lens) -> list[str]:
 
 def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
     """Return a sentence if the film is larger than the picture of the lens, where the picture's size is known."""
-    from neurolens.optics.setting.pupils import image_radius_mm
-
     if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):
         return []  # only a long search would tell
     return beyond_circle(film_mm, image_radius_mm(lens)[0], "the image circle", "may stay dark")

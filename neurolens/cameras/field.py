@@ -27,6 +27,7 @@ from neurolens.base.settings import LIGHT_NM
 from neurolens.cameras.ideal import PROJECTIONS
 from neurolens.cameras.sampling import axis_mm
 from neurolens.optics.lens import paraxial
+from neurolens.optics.lens.paraxial import first_order
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -99,8 +100,6 @@ def frame_of(camera: Any) -> Frame:
     if state["squeeze"] == 1:
         x = y
     elif lens is not None:
-        from neurolens.optics.lens.paraxial import first_order
-
         data, film = first_order(lens, meridian="x"), float(camera.settings["film_z_mm"])
         focal, pupil = (data.front_focal_z_mm, data.rear_focal_z_mm), data.entrance_pupil_z_mm
         x = paraxial.reach_mm(data.efl_mm, data.front_efl_mm, focal, pupil, film), film - pupil

@@ -18,7 +18,10 @@ from neurolens.base.errors import InputError, warned
 from neurolens.base.report import PART, Report, some_of
 from neurolens.base.settings import WAVELENGTH_NM, between, said, setting, wavelengths_nm, whole
 from neurolens.cli import arguments as cli
+from neurolens.optics.lens.glass import check_light
+from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.setting.copies import Tolerances
+from neurolens.optics.setting.states import focus_of, set_lens
 
 if TYPE_CHECKING:
     from neurolens.optics.analysis.corners import Spread
@@ -142,9 +145,6 @@ examples:
     def _scene(self) -> tuple[Scene, list[str]]:
         """Return the lens with its object in its state, and warnings."""
         from neurolens.optics.analysis.fields import Scene
-        from neurolens.optics.lens.glass import check_light
-        from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.setting.states import focus_of, set_lens
         from neurolens.studies.describe import file_doubts, rim_doubts
 
         with warned(self.file) as notes:  # such as glasses that contradict the catalogue, or constant indices

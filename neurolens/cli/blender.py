@@ -29,6 +29,8 @@ from neurolens.base.settings import RANGE, setting
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.base.tomlfile import suggestion
 from neurolens.cameras.build import ideal_as, make_camera
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.shaders.blender_shader import shader_of
 from neurolens.cli import arguments as cli
 from neurolens.models.card import read_card
@@ -37,6 +39,7 @@ from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.readers.any_format import read_any
 from neurolens.optics.readers.lensfile import read_lens
+from neurolens.optics.setting.states import set_lens
 from neurolens.programs.blender import Form, PackedLens, add_lens, check_takes, user_folders, write_pack
 
 _KEPT = 4096  # kept files, of some 30 kB each, five for a lens
@@ -228,8 +231,6 @@ def _code() -> list[str]:
 def _squeeze(file: Path, zoom: str | None) -> float:
     """Return the squeeze of a file's lens, see `cameras.sampling.lens_state`."""
     if not is_model(file):
-        from neurolens.optics.setting.states import set_lens
-
         return squeeze_of(set_lens(read_any(file), zoom=zoom))
     return float(
         make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom, runtime="onnxruntime")).settings["lens_state"][
@@ -295,8 +296,6 @@ def packed_of(
     Args:
         lens: its prescription, for the thumbnail, where it is at hand.
     """
-    from neurolens.optics.setting.states import set_lens
-
     first, ranged = files[0], zoom == RANGE
     if is_model(first):
         card = read_card(first)
@@ -333,8 +332,6 @@ def _character(lens: Lens) -> dict[str, Any]:
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
     """Return the lens behind a model, scaled and zoomed as the model is, or over its range; None without a file."""
-    from neurolens.optics.setting.states import set_lens
-
     facts = read_card(model)["lens"]
     file = lenses / f"{safe_name(facts['id'])}.toml"
     if not file.is_file():
@@ -349,8 +346,6 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
     """Return the field of a lens wide open, for `extension.library.Field`; None where it cannot be traced."""
     if find_spec("torch") is None:
         return None
-    from neurolens.cameras.exact import ExactCamera
-    from neurolens.cameras.field import spectrum_of
     from neurolens.studies.plan import footprints as prints
 
     film, radii = (2 * radius_mm, 2 * radius_mm), radius_mm * np.array(_RADII)
@@ -416,8 +411,6 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
 
 def thumbnail(lens: Lens) -> bytes | None:
     """Draw the section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
-    from neurolens.optics.setting.states import set_lens
-
     if find_spec("torch") is None or find_spec("matplotlib") is None:
         return None
     from PIL import Image

@@ -18,6 +18,7 @@ from neurolens.base.report import PART, Report
 from neurolens.base.settings import group, setting, setting_of
 from neurolens.cli import arguments as cli
 from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.assemble import first_order
 from neurolens.optics.readers.source import ReadOptions
 
 if TYPE_CHECKING:
@@ -60,7 +61,6 @@ examples:
         if self.out.exists() and not self.force:
             raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
         from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.readers.assemble import first_order
 
         with warned(self.file) as read:
             lens = read_any(self.file, self.unsaid)
@@ -148,7 +148,6 @@ class Converted(Report):
 def _converted(lens: Lens, notes: list[str], file: Path, out: Path) -> Converted:
     """Return the figures of a lens that was converted from a file to another."""
     from neurolens.optics.lens import paraxial
-    from neurolens.optics.readers.assemble import first_order
 
     data, efl_mm = first_order(lens), {"x": math.inf, "y": math.inf}
     axis: Literal["x", "y"]

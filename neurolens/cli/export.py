@@ -25,8 +25,11 @@ from neurolens.cli import arguments as cli
 from neurolens.graph.c import Extras
 from neurolens.graph.shading import LANGUAGES
 from neurolens.models import source
+from neurolens.models.inverse import inverse_of
 from neurolens.optics.lens.paraxial import film_z_mm
 from neurolens.optics.lens.shot import BY_LENSES
+from neurolens.optics.setting.focusing import best_focus_z_mm
+from neurolens.optics.setting.states import set_lens
 
 if TYPE_CHECKING:
     from neurolens.models.model import LensModel
@@ -266,9 +269,6 @@ def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
 
 def _fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[source.Fix, tuple[LensModel, ...]]:
     """Return the quantities that --fix sets, and the models in which they are fixed."""
-    from neurolens.optics.setting.focusing import best_focus_z_mm
-    from neurolens.optics.setting.states import set_lens
-
     film_z = fixed.get("film_z", [None])[0]
     stop = fixed.get("stop", [None])[0]
     if "f_number" in fixed:
@@ -306,6 +306,5 @@ def _write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, 
 def _write_inverse(model: LensModel, out: Path) -> Mapping[str, Mapping[str, float | str]]:
     """Write both inverse maps beside the model's file; return their files and the share of rays that each finds."""
     from neurolens.models.export import export_inverse
-    from neurolens.models.inverse import inverse_of
 
     return export_inverse(inverse_of(model), out, load_model(out).card["errors"])

@@ -16,6 +16,8 @@ from neurolens.base.lensname import resolve
 from neurolens.base.report import BULK, OPTIONAL, PART, Report
 from neurolens.base.settings import changed, setting
 from neurolens.cli import arguments as cli
+from neurolens.optics.readers.any_format import lens_files, read_any
+from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
 
 if TYPE_CHECKING:
     from neurolens.optics.analysis.breathing import Breath
@@ -104,8 +106,6 @@ examples:
     def _describe(self, file: Path) -> int:
         """Print and draw one lens."""
         from neurolens.models.pairs import domain_of
-        from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.setting.states import focus_mode_of, focus_of, set_lens
         from neurolens.studies.describe import file_doubts, glass_table, lens_facts
         from neurolens.studies.plots import layout_profile
 
@@ -143,8 +143,6 @@ examples:
 
     def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
         """Print a table of lenses."""
-        from neurolens.optics.readers.any_format import lens_files
-
         files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
         return self.answer(ListedLenses(self._rows(files, checked), self.sort))
 

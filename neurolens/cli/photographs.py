@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 from neurolens.base.report import PART, Report
 from neurolens.base.settings import WAVELENGTH_NM, changed, said, setting, wavelengths_nm, whole
 from neurolens.cli import arguments as cli
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.readers.lensfile import write_lens
+from neurolens.optics.setting.states import focus_of, set_lens
 
 if TYPE_CHECKING:
     from neurolens.optics.photographs.copy import FittedCopy
@@ -46,15 +49,12 @@ examples:
     def run(self) -> int:
         """Compare, draw, write."""
         from neurolens.optics.photographs.verify import FREE, plot_verified, verify
-        from neurolens.optics.readers.any_format import read_any
 
         tabled = read_any(self.file)
         found = verify(tabled, self.profile)
         if self.out is not None:
             plot_verified(found, self.out, tabled.believed_to_be or tabled.name)
         if self.lens_file is not None:
-            from neurolens.optics.readers.lensfile import write_lens
-
             write_lens(replace(tabled, measured=tuple(found.measured.items())), self.lens_file)
         files = [str(path) for path in (self.out, self.lens_file) if path is not None]
         return self.answer(Compared(str(self.file), tabled.name, found, found.measured, FREE, files))
@@ -147,9 +147,6 @@ examples:
         """Fit what is off in one copy."""
         from neurolens.optics.analysis.fields import Scene
         from neurolens.optics.photographs.copy import fit_copy, read_measured
-        from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.readers.lensfile import write_lens
-        from neurolens.optics.setting.states import focus_of, set_lens
 
         tabled, shot = read_any(self.file), self.state.shot()
         lens = set_lens(tabled, shot)
@@ -165,8 +162,6 @@ examples:
         """Fit rims to a profile."""
         from neurolens.optics.photographs.rims import fit_rims, with_fitted_rims
         from neurolens.optics.photographs.verify import found_for
-        from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.readers.lensfile import write_lens
 
         tabled = read_any(self.file)
         match, profiles, _ = found_for(tabled, self.profile)

@@ -13,6 +13,8 @@ from neurolens.base.records import plain, program
 from neurolens.base.report import BULK, PART, Report
 from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.states import set_lens
 
 if TYPE_CHECKING:
     from neurolens.optics.lens.prescription import Lens
@@ -66,8 +68,6 @@ fitted), and plan.toml, which 'render' and 'export' take for the camera."""
     def run(self) -> int:
         """Plan, write, print; return 1 where no camera for this target is within the budget."""
         began = os.times()
-        from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.setting.states import set_lens
         from neurolens.pictures.render.scene import load_scene
         from neurolens.studies.plan.effects_plot import plot_effects
         from neurolens.studies.plan.plan import plan
@@ -95,7 +95,6 @@ fitted), and plan.toml, which 'render' and 'export' take for the camera."""
 def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
     """Return the models that ship for a lens, or for a state of its zoom, by its id and its figures."""
     from neurolens.models.card import read_card
-    from neurolens.optics.setting.states import set_lens
 
     name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
     files = sorted((library() / "models").glob(f"{name}.*.onnx"))

@@ -27,7 +27,11 @@ from neurolens.base.tasks import Here
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import whole_pair
+from neurolens.optics.lens.glass import check_light
+from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.shot import BY_LENSES
+from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.states import focus_of, set_lens
 from neurolens.pictures.defocus.diffraction import MOST_PX, Channels, channels_of, places_of
 from neurolens.pictures.render.pictures import write_channels
 from neurolens.programs.psf import (
@@ -111,10 +115,6 @@ examples:
     def run(self) -> int:
         """Compute the parts that are missing, then write the file."""
         from neurolens.base.cluster import Dask
-        from neurolens.optics.lens.glass import check_light
-        from neurolens.optics.lens.paraxial import first_order
-        from neurolens.optics.readers.any_format import read_any
-        from neurolens.optics.setting.states import focus_of, set_lens
 
         write = self._writer()
         if self.side is not None and self.side % 2 == 0:

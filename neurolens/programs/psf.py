@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import read_arrays, write_arrays
+from neurolens.base.find import read_index
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.base.tasks import Failed, run_each
@@ -169,8 +170,6 @@ def channels_of_exr(arrays: Arrays, names: Sequence[str]) -> Arrays:
 
 def about(lens: Lens, settings: Mapping[str, Any], channels: Channels) -> dict[str, Any]:
     """Return what about.json says: units, channels, the lens and how photographs of the product agree with it."""
-    from neurolens.base.find import read_index
-
     row = read_index().get(f"{lens.lens_id}.toml", {}).get("row", {})
     checked = {key: row.get(key) for key in ("match", "verdict")}
     units = "lengths in mm, distances in m; psf: shares of a channel's light by pixel; rows from the top, upright"

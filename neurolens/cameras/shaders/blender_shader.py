@@ -29,6 +29,10 @@ from neurolens.models.source import OSL, checked_name, lines_of
 from neurolens.optics.lens.paraxial import film_z_mm, first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.any_format import read_any
+from neurolens.optics.setting.focusing import best_focus_of_stops_mm, film_range_mm, focus_states
+from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.setting.states import set_lens
+from neurolens.optics.trace.tracegraph import TRANSMITTANCE, exact_graph
 
 # For an exact lens: its nearest focus in focal lengths; and the share of the film's travel by which best focus may lie
 # next to the paraxial one.
@@ -134,10 +138,6 @@ def exact_lens(file: Path, zoom: str | float | None, report: Report) -> tuple[st
         InputError: a range is asked of a lens without zoom, or of one whose groups move to focus.
     """
     from neurolens.models.fit import StateSpace, axes_of, gap_axis
-    from neurolens.optics.setting.focusing import focus_states
-    from neurolens.optics.setting.pupils import pupil_plane_z_mm
-    from neurolens.optics.setting.states import set_lens
-    from neurolens.optics.trace.tracegraph import TRANSMITTANCE
 
     lens, state = read_any(file), None if zoom == RANGE else zoom
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
@@ -172,10 +172,6 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
         far, inside_m: where groups have moved to focus, the lens at infinity focus, which sets the picture's size, and
             the distance in focus.
     """
-    from neurolens.optics.setting.focusing import best_focus_of_stops_mm, film_range_mm
-    from neurolens.optics.setting.pupils import image_radius_mm, pupil_bounds
-    from neurolens.optics.trace.tracegraph import exact_graph
-
     data, (radius, _) = first_order(lens), image_radius_mm(far or lens)
     apart, efl = abs(float(data.rear_principal_z_mm - data.front_principal_z_mm)), float(data.efl_mm)
     near = math.inf if far else (_NEAR_EFL * abs(efl) + apart) / 1000

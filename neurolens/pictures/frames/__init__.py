@@ -45,7 +45,7 @@ from neurolens.pictures.render.colour import (
 )
 from neurolens.pictures.render.film import PixelGrid
 from neurolens.pictures.render.job import MEANING
-from neurolens.pictures.render.pictures import standard_attributes
+from neurolens.pictures.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.pictures.render.renderer import RenderResult, Watch, render, rows_of, tile_path, windows
 from neurolens.pictures.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
 from neurolens.pictures.render.sensor import about, expose
@@ -396,8 +396,6 @@ def write_pictures(
     Raises:
         NeurolensError: they cannot be written; it says how to resume.
     """
-    from neurolens.pictures.render.pictures import write_exr, write_png
-
     frame, files, (width, height) = prepared.frame, prepared.files, prepared.size
     space, camera = COLOUR_SPACES[prepared.film.colour_space], plain(prepared.camera.settings)
     metadata: dict[str, Any] = {
