@@ -5,8 +5,6 @@ position. One parameter moves all gaps linearly from state to state (as a focus 
 solved for the paraxial image of the object to lie on the film, which stays in place.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

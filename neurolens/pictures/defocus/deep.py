@@ -7,8 +7,6 @@ has the place of its block, the sizes of its parts, the running sums of the samp
 row and channel by channel. Compressed bytes are differences to the byte before, with the even bytes of the block first.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib

@@ -12,8 +12,6 @@ points of a place and depth that are alike share one. It is left out at film pix
 point.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections import defaultdict

@@ -13,8 +13,6 @@ Each channel has its own wavelengths, those that make its light from white surfa
 no noise of their own.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections.abc import Callable, Mapping, Sequence

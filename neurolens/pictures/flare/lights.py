@@ -7,8 +7,6 @@ A scene's lights are its rectangles, discs, spheres, points, spots and the sun, 
 them; a picture's are regions brighter than a threshold. The sky and other surroundings are no lights.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -3,8 +3,6 @@
 The tables of shapes, materials and lights are defined in `neurolens.pictures.render.scenetables`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
