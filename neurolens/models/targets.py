@@ -13,15 +13,15 @@ import math
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.base.settings import check_bounds, setting
+from neurolens.base.errors import NeurolensWarning
+from neurolens.base.settings import Rule, check_bounds, setting
 from neurolens.models.assemble import tilt_series
 from neurolens.models.cores import DIRECTION, POSITION, STOP, Array, LightField, Refracted, angle_vector
 from neurolens.models.fitted import Domain, Encoding, FilmRays, Gate, Scales
@@ -202,10 +202,14 @@ class ModelSettings:
     elimination: bool = setting(True, "whether ols first chooses half as many terms again, and drops the cheapest")
     # From 2 on a few more rounds follow where directions still err.
     growth: int = setting(2, "rounds in which ols adds products of the chosen terms to the candidates", within=(0, 16))
-    position_weight: float = setting(2.0, "weight of the position in the choice of terms, relative to first order")
+    position_weight: Annotated[float, Rule(lambda weight: 0 < weight < math.inf, "a number above 0")] = setting(
+        2.0, "weight of the position in the choice of terms, relative to first order"
+    )
     transmittance_terms: int = setting(TRANSMITTANCE_TERMS, "most terms of the transmittance", within=(1, 200))
     phase: bool = setting(False, "whether the optical path is one more output, of up to 240 terms of its own")
-    idle_gates: float = setting(0.0, "rims that alone block at most this share of the domain's rays are left out")
+    idle_gates: Annotated[float, Rule(lambda share: 0 <= share < 1, "a share from 0 to below 1")] = setting(
+        0.0, "rims that alone block at most this share of the domain's rays are left out"
+    )
     planes: bool = setting(True, "whether methods of `PLANES_SEARCHED` search the planes of the light field")
     units: int = setting(16, "units of each layer of a network", within=(1, 512))
     layers: int = setting(2, "layers of a network", within=(1, 8))
@@ -215,12 +219,6 @@ class ModelSettings:
 
     def __post_init__(self) -> None:
         check_bounds(self, "settings")
-        for name, good, expected in (
-            ("idle_gates", 0 <= self.idle_gates < 1, "a share from 0 to below 1"),
-            ("position_weight", 0 < self.position_weight < math.inf, "a number above 0"),
-        ):
-            if not good:
-                raise InputError("settings", name, getattr(self, name), expected)
 
     @property
     def label(self) -> str:

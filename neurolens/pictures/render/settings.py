@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from neurolens.base.errors import InputError
-from neurolens.base.settings import check_bounds, setting
+from neurolens.base.settings import bounded, check_bounds, setting
 
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero"]
@@ -146,27 +146,24 @@ class Scatter:
         0.0, "share of light that the barrel, its rings and the stop reflect, a fifth of it glossily", within=(0, 1),
         metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
-    gloss: float = 0.2
+    gloss: Annotated[float, bounded(0, 1)] = 0.2
     sensor: float = setting(
         0.0, "share of light that the film reflects, half of it as a mirror does", within=(0, 0.9),
         metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
-    mirror: float = 0.5
+    mirror: Annotated[float, bounded(0, 1)] = 0.5
     dust: float = setting(
         0.0, "share of the front that is dusty; dust scatters light with a mean cosine of 0.98", within=(0, 1),
         metavar="SHARE", title=OF_PHOTONS,
     )  # fmt: skip
-    dust_forward: float = 0.98
+    dust_forward: Annotated[float, bounded(0, 0.9999)] = 0.98
     haze_per_mm: float = setting(
         0.0, "scattering in glass, inverse of the mean free path, mean cosine 0.9", within=(0, 10), title=OF_PHOTONS,
     )  # fmt: skip
-    haze_forward: float = 0.9
+    haze_forward: Annotated[float, bounded(0, 0.9999)] = 0.9
 
     def __post_init__(self) -> None:
         check_bounds(self, "scatter")
-        for name, most in (("gloss", 1.0), ("mirror", 1.0), ("dust_forward", 0.9999), ("haze_forward", 0.9999)):
-            if not 0 <= (value := getattr(self, name)) <= most:
-                raise InputError("scatter", name, value, f"a number from 0 to {most:g}")
 
     @property
     def on(self) -> bool:
