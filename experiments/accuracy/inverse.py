@@ -43,7 +43,7 @@ from neurolens.models.pairs import PairSettings, domain_of, make_pairs
 from neurolens.models.terms import pinned_threads
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
-from neurolens.optics.trace.surfaces import front_rays
+from neurolens.optics.trace.surfaces import Rays, front_rays
 from neurolens.studies.experiment import LensChoice
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
@@ -103,7 +103,7 @@ def _published(inverse: InverseModel, rays: Array, film_z: Array) -> dict[str, A
     forward = evaluate(model.graph, {"rays": rays, "film_z_mm": film_z[None], "stop_radius_mm": radius})
     passed = forward["status"][0] == st.PASSED
     rays, film_z, scene_ray = rays[:, passed], film_z[passed], forward["scene_ray"][:, passed]
-    known, _ = front_rays(model.front, *scene_ray, index=front_index(model), wavelength_nm=rays[4])
+    known, _ = front_rays(model.front, Rays(*scene_ray), index=front_index(model), wavelength_nm=rays[4])
     wanted = np.concatenate([known[:2] / model.scales.position_mm, known[2:]])
     scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays[4:]})
     stop = _stop_inputs(model, rays, film_z, forward["stop_xy_mm"][:, passed])

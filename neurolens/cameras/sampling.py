@@ -18,7 +18,7 @@ from neurolens.cameras.pose import FilmPose
 from neurolens.optics.lens.prescription import Surface
 from neurolens.optics.lens.shot import Shot
 from neurolens.optics.trace.shapes import sag_mm
-from neurolens.optics.trace.surfaces import meet_front
+from neurolens.optics.trace.surfaces import Rays, meet_front
 
 _BEYOND = 1.02  # largest diagonal of a film over its image circle: 36x24 on 43.2 mm is engraved so
 _ANGLES, _LEVELS, _ROOM = 24, 5, 1.01  # intervals and levels of `FrontDiscs`, and by how much its discs are widened
@@ -49,7 +49,7 @@ class FrontDiscs:
     @staticmethod
     def of(leaving: NDArray[np.float64], shape: Surface | None) -> FrontDiscs:
         """Return the discs of scene rays [6, N] (mm, lens frame); `shape` is the surface's, None the plane z = 0."""
-        x, y = meet_front(shape, *leaving)
+        x, y = meet_front(shape, Rays(*leaving))
         side = np.hypot(leaving[3], leaving[4])
         angle, azimuth = np.arctan2(side, -leaving[5]), (leaving[3] + 1j * leaving[4]) / np.maximum(side, 1e-12)
         width, place, far = angle.max() / _ANGLES, (x + 1j * y) * azimuth.conj(), float(np.hypot(x, y).max())

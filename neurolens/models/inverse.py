@@ -51,7 +51,7 @@ from neurolens.models.cores import (
 )
 from neurolens.models.fitted import Domain, Encoding
 from neurolens.models.model import LensModel
-from neurolens.optics.trace.surfaces import front_rays
+from neurolens.optics.trace.surfaces import Rays, front_rays
 
 STEPS = 3
 # A solution counts where its residual is below this: in stop radii; in front radii and radians.
@@ -191,8 +191,8 @@ class InverseModel:
         """
         origin, away = _checked(3, origin_mm=origin_mm, direction=direction)
         waves = _each("wavelength_nm", wavelength_nm, origin)
-        lines = (*origin.astype(np.float64), *away.astype(np.float64))
-        front, solid = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=waves[0])
+        lines = Rays(*origin.astype(np.float64), *away.astype(np.float64))
+        front, solid = front_rays(self.model.front, lines, index=front_index(self.model), wavelength_nm=waves[0])
         given = np.concatenate([front, waves]).astype(origin.dtype)
         out = self._solved("scene", {"front_rays": given}, film_z_mm, stop_radius_mm, steps)
         with np.errstate(all="ignore"):  # from the area of direction vectors to solid angle

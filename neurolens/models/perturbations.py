@@ -39,7 +39,7 @@ from neurolens.models.terms import (
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.copies import Off, Tolerances, draws_of, elements_of, perturbed
-from neurolens.optics.trace.surfaces import front_rays
+from neurolens.optics.trace.surfaces import Rays, front_rays
 
 # Rays of each kind that are traced for each figure, and how many are drawn to find them.
 _RAYS, _DRAWN = 2500, 30_000
@@ -71,7 +71,7 @@ def exact_answers(model: LensModel, lens: Lens, inputs: FilmRays) -> Answers:
     rays = replace(inputs, film_z=inputs.film_z + shift)
     pairs = trace_pairs(lens, rays, model.domain.pupil_z_mm + shift, power=False)
     x, y, z, *d = (c.numpy() for c in pairs.scene)
-    found, _ = front_rays(model.front, x, y, z - shift, *d)
+    found, _ = front_rays(model.front, Rays(x, y, z - shift, *d))
     vectors = torch.empty((3, 2, len(inputs)), dtype=torch.float64)
     vectors[POSITION] = torch.from_numpy(found[:2]) / model.scales.position_mm
     vectors[DIRECTION] = torch.from_numpy(found[2:])

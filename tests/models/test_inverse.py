@@ -30,7 +30,7 @@ from neurolens.models.inverse import InverseModel, convergence, front_index, inv
 from neurolens.models.model import LensModel
 from neurolens.models.pairs import PairSet, sample_domain, trace_pairs
 from neurolens.optics.trace.shapes import sag_and_derivatives
-from neurolens.optics.trace.surfaces import front_rays
+from neurolens.optics.trace.surfaces import Rays, front_rays
 from neurolens.optics.trace.tracegraph import exact_graph
 
 GAUSS, FISHEYE, ASPHERE = "laikin_double_gauss_50", "horimoto_fisheye_16", "canon_aspheric_50"
@@ -315,7 +315,7 @@ def test_exported_maps_are_the_inverse_maps(kind: str, tmp_path: Path) -> None:
     rays, film_z = _numpy(sampled)
     forward = _forward(inv.model, rays, film_z)
     stop, scene = forward["stop_xy_mm"], forward["scene_ray"]
-    front, solid = front_rays(inv.model.front, *scene, index=front_index(inv.model), wavelength_nm=rays[4])
+    front, solid = front_rays(inv.model.front, Rays(*scene), index=front_index(inv.model), wavelength_nm=rays[4])
     given = {"stop": ("stop_rays", [*rays[:2], *stop, rays[4]]), "scene": ("front_rays", [*front, rays[4]])}
     wanted = {
         "stop": inv.through_stop(rays[:2], stop, rays[4], film_z),

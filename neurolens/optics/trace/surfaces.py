@@ -438,18 +438,16 @@ def radius2(o: Arithmetic, met: Hit) -> Any:
     return o.dot(met[:2], met[:2])
 
 
-def meet_front(
-    shape: Surface | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
-) -> tuple[Array, Array]:
+def meet_front(shape: Surface | None, lines: Rays) -> tuple[Array, Array]:
     """Return (x, y) where the line of each ray meets the front surface next to its vertex; NaN where it does not.
 
     Args:
         shape: the front surface; None is the plane z = 0.
-        x, y, z, dx, dy, dz: points (mm) and directions of either sense, float64 [N].
+        lines: float64 [N], of either sense.
     """
     # In front of the lens light travels towards +z, or comes from the side and beyond: the sense is that of the camera
     # ray's end.
-    rays = Rays(x, y, z, -dx, -dy, -dz)
+    rays = Rays(*lines[:3], *(-d for d in lines[3:]))
     curve = Curve(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
     with np.errstate(all="ignore"):
         met = meet(NUMPY, rays, curve, 1, AIR, entering=True)
@@ -458,16 +456,7 @@ def meet_front(
 
 
 def front_rays(
-    shape: Surface | None,
-    x: Array,
-    y: Array,
-    z: Array,
-    dx: Array,
-    dy: Array,
-    dz: Array,
-    *,
-    index: Sequence[float] | None = None,
-    wavelength_nm: Array | float = math.nan,
+    shape: Surface | None, lines: Rays, *, index: Sequence[float] | None = None, wavelength_nm: Array | float = math.nan
 ) -> tuple[Array, Array]:
     """Return scene rays in the form that models use, and the solid angle per area of their direction vectors [N].
 
@@ -475,12 +464,12 @@ def front_rays(
     theta is the angle to -z. First-order models, which have no shape, have the slope in its place.
 
     Args:
-        shape, x, y, z: as for `meet_front`.
-        dx, dy, dz: unit directions away from the lens.
+        shape: as for `meet_front`.
+        lines: of scene rays, with unit directions away from the lens.
         index: given where direction vectors are those inside the front glass: its index as a power series in 1 /
             lambda^2 (1/um^2).
     """
-    x, y = meet_front(shape, x, y, z, dx, dy, dz)
+    (x, y), (dx, dy, dz) = meet_front(shape, lines), lines[3:]
     with np.errstate(all="ignore"):
         if shape is None:
             return np.stack([x, y, dx / -dz, dy / -dz]), np.abs(dz) ** 3

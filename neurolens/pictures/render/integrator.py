@@ -46,6 +46,20 @@ class Paths:
     density: FloatArray
     shared: FloatArray
 
+    @classmethod
+    def of(
+        cls,
+        origin: FloatArray,
+        direction: FloatArray,
+        weight: FloatArray,
+        bins: Index,
+        shared: FloatArray | None = None,
+    ) -> Paths:
+        """Return the paths of camera rays of a weight [lanes, N]; without `shared`, all lanes share each."""
+        count = weight.shape[-1]
+        together = np.full(count, len(weight), np.float32) if shared is None else shared
+        return cls(origin, direction, weight, bins, np.arange(count), np.full(count, SPECULAR), together)
+
     def take(self, rows: Index) -> Paths:
         """Return the paths of these rows."""
         vectors = (self.origin.take(rows, axis=1), self.direction.take(rows, axis=1))
@@ -242,32 +256,24 @@ def trace(
     world: World,
     sampler: Sampler,
     keys: PathKeys,
-    origin: FloatArray,
-    direction: FloatArray,
-    weight: FloatArray,
-    bins: Index,
+    paths: Paths,
     max_depth: int,
     *,
     aim: bool = True,
     first_distance: FloatArray | None = None,
-    shared: FloatArray | None = None,
 ) -> FloatArray:
     """Return weight times radiance [lanes, N] that arrives along camera rays, at the wavelengths of each path.
 
     Args:
-        keys: for the random numbers of the paths. origin, direction: [3, N], m.
-        weight: [lanes, N]; paths of weight 0 cost nothing. bins: [N] the first lane's wavelength bin.
+        keys: for the random numbers of the paths.
+        paths: those of the camera rays (m); of weight 0, they cost nothing.
         max_depth: number of surfaces along a path at which light is scattered.
         aim: whether to sample lights directly; without it the mean is the same, found by scattering alone.
         first_distance: [N], which gets the distance (m) to what camera rays hit first, inf for nothing; paths of
             weight 0 are left out.
-        shared: [N] how many wavelengths share a path; left out, all lanes do.
     """
-    radiance = np.zeros(weight.shape[::-1], np.float32)
-    count = weight.shape[-1]
-    density, together = np.full(count, SPECULAR), np.full(count, len(weight), np.float32)
-    shared = together if shared is None else shared
-    paths = Paths(origin, direction, weight, bins, np.arange(count), density, shared).take(lit(weight))
+    radiance = np.zeros(paths.throughput.shape[::-1], np.float32)
+    paths = paths.take(lit(paths.throughput))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for depth in range(max_depth + 1):
             if not paths.slot.size:

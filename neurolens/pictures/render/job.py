@@ -31,7 +31,7 @@ from neurolens.pictures.render.colour import (
     illuminant,
 )
 from neurolens.pictures.render.film import Film, PixelGrid, Spill, Tiling, digest
-from neurolens.pictures.render.integrator import trace
+from neurolens.pictures.render.integrator import Paths, trace
 from neurolens.pictures.render.lights import sun_spectrum, total_spectrum
 from neurolens.pictures.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.pictures.render.scene import CameraSettings, Scene
@@ -196,10 +196,11 @@ class Job:
         answered = time.perf_counter()
 
         bins, distance = self.spectral.bin_of(hue), np.full(len(hue), np.inf, np.float32)
-        rays, shared = (lens.origin, lens.direction, lens.weight, bins), None
+        shared = None
         if lens.places is not None:
             shared = (lens.weight > 0).sum(axis=0, dtype=np.uint8).astype(np.float32)
-        value = trace(self.world, self.sampler, keys, *rays, self.max_depth, first_distance=distance, shared=shared)
+        paths = Paths.of(lens.origin, lens.direction, lens.weight, bins, shared)
+        value = trace(self.world, self.sampler, keys, paths, self.max_depth, first_distance=distance)
         sums = np.empty((len(pixels), columns.COLUMNS))
         spill = self._sum_light(sums, value, bins, lens, within)
         self._sum_depth(sums, lens.origin, lens.direction, distance)

@@ -130,7 +130,7 @@ def test_the_front_of_a_model_is_the_surface_that_is_traced(shape: dict[str, Any
     out = trace(lens, random_rays(200), towards="film", path=True)
     met = (out.status == 0).numpy()
     back = [c.numpy() for c in random_rays(200)]
-    found = meet_front(lens.surfaces[0], *back[:3], *(-c for c in back[3:]))
+    found = meet_front(lens.surfaces[0], Rays(*back[:3], *(-c for c in back[3:])))
     assert np.allclose(np.stack(found)[:, met], torch.stack(out.path[0][:2]).numpy()[:, met], rtol=0, atol=1e-10)
     _, zx, zy = sag_and_derivatives(lens.surfaces[0], x.numpy(), y.numpy())
     step = 1e-5

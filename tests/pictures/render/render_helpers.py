@@ -10,7 +10,7 @@ import numpy as np
 
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.pictures.render.colour import SpectralRange
-from neurolens.pictures.render.integrator import trace
+from neurolens.pictures.render.integrator import Paths, trace
 from neurolens.pictures.render.sampler import Sampler
 from neurolens.pictures.render.scene import Scene, scene_from_tables
 from neurolens.pictures.render.world import World
@@ -86,7 +86,7 @@ def radiance(
     rays = [np.repeat(np.float32(v)[:, None], count, axis=1) for v in (origin, direction)]
     bins = np.arange(count) * 256 // count if pixels == 1 else np.full(count, 128)
     weight = np.ones((lanes, count), np.float32)
-    found = trace(made, sampler, sampler.keys(pixel, sample), *rays, weight, bins, max_depth, aim=aim)
+    found = trace(made, sampler, sampler.keys(pixel, sample), Paths.of(*rays, weight, bins), max_depth, aim=aim)
     return found if lanes > 1 else found[0]
 
 

@@ -12,7 +12,7 @@ from render_helpers import FLOOR, MATERIALS, WHITE, assert_aimed, on_floor, radi
 from neurolens.cameras.ideal import Pinhole
 from neurolens.pictures.render.colour import SpectralRange
 from neurolens.pictures.render.film import PixelGrid
-from neurolens.pictures.render.integrator import trace
+from neurolens.pictures.render.integrator import Paths, trace
 from neurolens.pictures.render.sampler import FILM, DirectionTable, Sampler, centres
 from neurolens.pictures.render.scene import load_scene
 from neurolens.pictures.render.world import World
@@ -348,7 +348,8 @@ def test_cornell_box_agrees_with_mitsuba(nm: float) -> None:
     assert settings.up == (0, 1, 0) and settings.look_at_m[:2] == settings.position_m[:2]
     origin = axes @ rays.origin_m + np.float32(settings.position_m)[:, None]
     bins = np.zeros(count, np.intp)
-    found = trace(world, sampler, keys, origin, axes @ rays.direction, np.ones((1, count), np.float32), bins, 40)
+    paths = Paths.of(origin, axes @ rays.direction, np.ones((1, count), np.float32), bins)
+    found = trace(world, sampler, keys, paths, 40)
 
     (lamp,) = scene.settings.quads
     parts = found.reshape(8, PIXELS // 8, 8, PIXELS // 8, SAMPLES) / lamp.emission[0]
