@@ -294,6 +294,19 @@ def keep_newest(new: Path, most: int) -> None:
             file.unlink()
 
 
+def how_to_resume(folder: Path) -> str:
+    """Say in a sentence how to resume work whose finished parts are in a folder."""
+    return f"what is done is kept in {folder}: the same command goes on"
+
+
+def forget_parts(folder: Path, pattern: str) -> None:
+    """Remove the parts of finished work, which the pattern names, and their folder if it holds nothing else."""
+    with suppress(OSError):
+        for part in folder.glob(pattern):
+            part.unlink()
+        folder.rmdir()
+
+
 def safe_name(text: str) -> str:
     """Return a name of a file, or of an archive's entry, for `text`, wherever that comes from.
 

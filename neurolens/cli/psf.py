@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from neurolens.base.errors import note
-from neurolens.base.files import write_arrays
+from neurolens.base.files import forget_parts, how_to_resume, write_arrays
 from neurolens.base.lensname import is_model
 from neurolens.base.report import Report
 from neurolens.base.settings import (
@@ -39,8 +39,6 @@ from neurolens.programs.psf import (
     PsfTask,
     about,
     channels_of_exr,
-    forget,
-    how_to_resume,
     library_of,
 )
 
@@ -142,7 +140,7 @@ examples:
             settings["model"] = {"file": self.file.name, "errors": loaded.card["errors"]}
         facts = about(lens, settings, waves)
         write(arrays, facts)
-        forget(folder)
+        forget_parts(folder, "*.npz")
         if self.plot is not None:
             from neurolens.optics.analysis.plots import plot_point_spread
 

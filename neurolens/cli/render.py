@@ -14,7 +14,7 @@ from typing import Any
 
 from neurolens.base.cluster import Dask, distributed
 from neurolens.base.errors import NeurolensError, printable, warn
-from neurolens.base.files import atomic_write_text, library
+from neurolens.base.files import atomic_write_text, how_to_resume, library
 from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
 from neurolens.base.records import program
@@ -25,7 +25,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cli import arguments as cli
 from neurolens.cli.keys import Frames, frames_group, numbered
 from neurolens.pictures.frames import Files, Frame, Picture, Prepared, flare_choice, flare_of, prepare, write_pictures
-from neurolens.pictures.frames.farm import how_to_resume, render_frames
+from neurolens.pictures.frames.farm import render_frames
 from neurolens.pictures.render.pictures import write_png
 from neurolens.pictures.render.renderer import Merged, RenderResult, Statistics, Watch, merge_tiles, tile_path
 from neurolens.pictures.render.settings import FilmSettings, SensorSettings

@@ -17,7 +17,6 @@ upright: row 0 is its top.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.base.files import read_arrays, write_arrays
+from neurolens.base.files import how_to_resume, read_arrays, write_arrays
 from neurolens.base.find import read_index
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
@@ -127,19 +126,6 @@ def library_of(
         "f_number": np.array([*lenses]),
         "distance_m": np.array(distances_m),
     }
-
-
-def forget(folder: Path) -> None:
-    """Remove the parts of a library that is written."""
-    for part in folder.glob("*.npz"):
-        part.unlink()
-    with suppress(OSError):
-        folder.rmdir()
-
-
-def how_to_resume(folder: Path) -> str:
-    """Say in a sentence how to resume a library whose parts are in a folder."""
-    return f"parts that are done are kept in {folder}: the same command goes on"
 
 
 def read_psf(path: Path) -> tuple[dict[str, Any], Arrays]:

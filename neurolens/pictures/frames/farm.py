@@ -13,7 +13,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.cluster import absolute, packed, run_with_files, unpack
 from neurolens.base.errors import NeurolensError
-from neurolens.base.files import noted_files
+from neurolens.base.files import forget_parts, how_to_resume, noted_files
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.optics.readers.glasses import more_glasses
@@ -116,16 +115,8 @@ def render_frames(
             report(done / count)
         # Pictures of which all tiles were there.
         pictures |= {picture.out: _finish(picture, prepared) for picture in todo.values()}
-    with suppress(OSError):
-        for stale in folder.glob("*.tile-*.exr"):
-            stale.unlink()
-        folder.rmdir()
+    forget_parts(folder, "*.tile-*.exr")
     return [pictures[out] for out in frames]
-
-
-def how_to_resume(folder: Path) -> str:
-    """Say in a sentence how to resume frames whose tiles are in a folder."""
-    return f"tiles that are done are kept in {folder}: the same command goes on"
 
 
 def _picture(
