@@ -27,7 +27,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.base.settings import LARGEST_SEED, whole
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers.lensfile import read_lens

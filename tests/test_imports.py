@@ -60,7 +60,7 @@ LEAN_MODULES = {
 # Statements that each room has, as the last issue left it: what a reader has to hold. A room that grows by more than
 # SLACK pays by what it replaces, or an issue gives it more.
 STATEMENTS = {
-    "__init__": 23, "__main__": 4, "base": 2020, "graph": 2705, "optics": 10140, "models": 4580, "cameras": 4270,
+    "__init__": 23, "__main__": 4, "base": 1950, "graph": 2705, "optics": 10140, "models": 4580, "cameras": 4270,
     "pictures": 7635, "programs": 2720, "studies": 3075, "cli": 4265, "front": 208,
 }  # fmt: skip
 SLACK = 1.03

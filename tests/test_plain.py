@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import failure
 
-from neurolens.base.records import program
+from neurolens.base.errors import program
 from neurolens.cli import build_parser, main
 from neurolens.cli.defocus import Defocus
 from neurolens.optics.lens.shot import FILMS, film_size, film_within

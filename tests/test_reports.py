@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neurolens.base.records import plain
-from neurolens.base.report import BULK, PART, Report, csv_text, over, tables_of
+from neurolens.base.report import BULK, PART, Report, csv_text, over, plain, tables_of
 from neurolens.cli import main
 
 ROOT = Path(__file__).parents[1]

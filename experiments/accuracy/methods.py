@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import fingerprint_of, read_kept, sha256_of, write_kept
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress, Report
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.cameras.model import load_model
 from neurolens.models.export import export_onnx
 from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, prepare

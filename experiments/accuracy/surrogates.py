@@ -26,7 +26,7 @@ from experiments.lab import markdown_table
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain, versions
+from neurolens.base.report import plain
 from neurolens.base.settings import LIGHT_NM, add_options, whole
 from neurolens.cli.arguments import Reporting, check_ids, check_written, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
@@ -34,6 +34,7 @@ from neurolens.models.pairs import PairSettings
 from neurolens.studies.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.studies.pages import DASH, Column, Record, number, show
 from neurolens.studies.plots import Kinds, trade_plot
+from neurolens.studies.records import versions
 
 DEFAULT_LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200", "schaefter_primoplan_100", "horimoto_fisheye_16", "phone_lens_6"

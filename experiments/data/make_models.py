@@ -32,7 +32,6 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
 from neurolens.base.find import read_index as read_lenses
 from neurolens.base.progress import Progress
-from neurolens.base.records import versions
 from neurolens.base.settings import LIGHT_NM, RANGE, read_config
 from neurolens.cameras.model import load_model
 from neurolens.models.fit import NETWORKS, ModelSettings, prepare
@@ -48,6 +47,7 @@ from neurolens.studies.check import check_model, check_states
 from neurolens.studies.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.studies.measure import Measured, fit_and_measure, shared_rays
 from neurolens.studies.rays import REFERENCE_RADIUS_MM
+from neurolens.studies.records import versions
 from neurolens.studies.speed import EXACT, exact_c_candidate, model_candidate, model_candidates, race
 from neurolens.studies.train import fit_and_measure_states, state_settings
 

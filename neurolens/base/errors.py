@@ -2,6 +2,8 @@
 
 import os
 import re
+import shlex
+import shutil
 import sys
 import warnings
 from collections.abc import Iterator
@@ -120,6 +122,14 @@ def pip_install(extra: str) -> str:
     """Return the command that installs an extra of this project: in a checkout from there, else by our name on PyPI."""
     checkout = (Path(__file__).parents[2] / "pyproject.toml").is_file()
     return f"pip install '{'.' if checkout else neurolens.DISTRIBUTION}[{extra}]'"
+
+
+def program() -> str:
+    """Return how a command line begins here: "neurolens" if it is on the PATH, else the words that began this one."""
+    if shutil.which("neurolens"):
+        return "neurolens"
+    started = sys.argv[0]
+    return shlex.quote(started) if Path(started).name == "neurolens" else f"{shlex.quote(sys.executable)} -m neurolens"
 
 
 def missing(error: BaseException) -> str:

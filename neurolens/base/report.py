@@ -1,4 +1,4 @@
-"""The answer of a command: a dataclass, of which JSON (`records.plain`), a text and tables for CSV are made.
+"""The answer of a command: a dataclass, of which JSON (`plain`), a text and tables for CSV are made.
 
 Its fields are the keys of the JSON and the columns of the tables, with units in their names::
 
@@ -14,6 +14,7 @@ writes falloff.csv, with a row of what is said once, and falloff.field-wavelengt
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -21,7 +22,6 @@ from typing import Any, TypeVar
 
 from neurolens.base.errors import printable
 from neurolens.base.files import atomic_write_text
-from neurolens.base.records import plain
 from neurolens.base.settings import without_unit
 
 T = TypeVar("T")
@@ -55,6 +55,35 @@ def over(*axes: str) -> dict[str, Any]:
     each array lies over the axes of the field that its key names.
     """
     return {"over": axes}
+
+
+def plain(value: Any, strict: bool = True, full: bool = True) -> Any:
+    """Return `value` in JSON's own types: scalars and arrays of numpy and torch become numbers and lists, paths text.
+
+    A dataclass becomes a mapping of its fields; fields in bulk are in it only if `full` asks for them.
+
+    Infinity becomes the text "infinity" or "-infinity" and NaN null; unless `strict` both stay floats. In a path that
+    is no UTF-8, the bytes that are no letters become \\u and four digits.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, strict, full) for key, item in value.items()}
+    if is_dataclass(value):
+        found: dict[str, Any] = {}
+        for f in fields(value):
+            item = getattr(value, f.name)
+            if (full or "bulk" not in f.metadata) and not (item is None and "optional" in f.metadata):
+                item = plain(item, strict, full)
+                found |= item if "part" in f.metadata else {f.name: item}
+        return found
+    if hasattr(value, "tolist"):
+        return plain(value.tolist(), strict)
+    if isinstance(value, list | tuple):
+        return [plain(item, strict, full) for item in value]
+    if strict and isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    return str(value).encode("utf-8", "backslashreplace").decode()
 
 
 def tables_of(answer: Any, name: str) -> dict[str, Rows]:

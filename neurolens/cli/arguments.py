@@ -15,12 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.errors import InputError, note, one_line, printable, warn
+from neurolens.base.errors import InputError, note, one_line, printable, program, warn
 from neurolens.base.files import check_writable, library
 from neurolens.base.lensname import lens_id_of, resolve, split_kind
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain, program
-from neurolens.base.report import Report, write_tables
+from neurolens.base.report import Report, plain, write_tables
 from neurolens.base.settings import (
     add_options,
     from_options,

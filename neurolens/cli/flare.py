@@ -17,8 +17,7 @@ import numpy as np
 from neurolens import __version__
 from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain
-from neurolens.base.report import BULK, OPTIONAL, PART, Report
+from neurolens.base.report import BULK, OPTIONAL, PART, Report, plain
 from neurolens.base.settings import changed, group, positive, setting
 from neurolens.base.units import in_unit
 from neurolens.cameras.build import make_camera

@@ -9,8 +9,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.base.errors import note
 from neurolens.base.progress import duration
-from neurolens.base.records import plain
-from neurolens.base.report import BULK, PART, Report
+from neurolens.base.report import BULK, PART, Report, plain
 from neurolens.base.settings import positive, setting, whole
 from neurolens.cli import arguments as cli
 from neurolens.pictures.frames import Files

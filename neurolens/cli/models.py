@@ -11,15 +11,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import ModelError, NeurolensWarning
+from neurolens.base.errors import ModelError, NeurolensWarning, program
 from neurolens.base.files import library
 from neurolens.base.lensname import is_model, lens_id_of
-from neurolens.base.records import Timing, program, reaches, time_of
 from neurolens.base.report import OPTIONAL, PART, Report
 from neurolens.base.settings import setting, whole
 from neurolens.base.tomlfile import suggestion
 from neurolens.cli import arguments as cli
 from neurolens.studies.pages import CLOSE_UM, Advice, advice, expected_exact, to_use
+from neurolens.studies.records import Timing, reaches, time_of
 
 if TYPE_CHECKING:
     from neurolens.studies.check import Promise

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from neurolens.base.errors import program
 from neurolens.base.files import atomic_write_text, library, write_json
-from neurolens.base.records import plain, program
-from neurolens.base.report import BULK, PART, Report
+from neurolens.base.report import BULK, PART, Report, plain
 from neurolens.base.settings import setting
 from neurolens.cli import arguments as cli
 from neurolens.optics.readers.any_format import read_any

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.cluster import Dask, distributed
-from neurolens.base.errors import NeurolensError, printable, warn
+from neurolens.base.errors import NeurolensError, printable, program, warn
 from neurolens.base.files import atomic_write_text, how_to_resume, library
 from neurolens.base.html import html
 from neurolens.base.progress import Progress, duration
-from neurolens.base.records import program
 from neurolens.base.report import PART, Report
 from neurolens.base.settings import changed, group, positive, setting
 from neurolens.base.tasks import Stopping, Unfinished

@@ -17,8 +17,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain
-from neurolens.base.report import PART, Report
+from neurolens.base.report import PART, Report, plain
 from neurolens.base.settings import LIGHT_NM, between, positive, setting, wavelengths_nm
 from neurolens.cameras.build import near_of
 from neurolens.cameras.contract import Camera, FloatArray

@@ -15,12 +15,12 @@ from neurolens.base.errors import NeurolensError, one_line, printable
 from neurolens.base.files import read_bytes
 from neurolens.base.lensname import lens_id_of, resolve
 from neurolens.base.progress import Progress
-from neurolens.base.records import NOISY, noisy
 from neurolens.base.report import PART, Report
 from neurolens.base.settings import setting, whole
 from neurolens.base.tasks import Processes, cores
 from neurolens.cli import arguments as cli
 from neurolens.studies.pages import advice, ns_text
+from neurolens.studies.records import NOISY, noisy
 
 if TYPE_CHECKING:
     from neurolens.studies.survey import Summary

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from neurolens import __version__
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html
-from neurolens.base.records import plain
-from neurolens.base.report import OPTIONAL
+from neurolens.base.report import OPTIONAL, plain
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import (
     DIM,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.base.settings import (
     FILM_MM,
     LARGEST_SEED,

@@ -29,7 +29,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import how_to_resume, read_arrays, write_arrays
 from neurolens.base.find import read_index
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.base.tasks import Failed, run_each
 from neurolens.models.model import LensModel
 from neurolens.optics.lens.prescription import Lens

@@ -19,11 +19,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, program
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.html import html, local_url
-from neurolens.base.records import NOISY, ExactRecord, Results, error_of, noisy, pareto_front, program, reaches, time_of
 from neurolens.base.settings import RANGE
+from neurolens.studies.records import NOISY, ExactRecord, Results, error_of, noisy, pareto_front, reaches, time_of
 
 C = TypeVar("C")
 R = TypeVar("R", bound=Mapping[str, Any])

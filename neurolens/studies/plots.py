@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurolens.base.errors import InputError
-from neurolens.base.records import NOISY, noisy, pareto_front, time_of
 from neurolens.models.axes import Axis
 from neurolens.models.fitted import Domain
 from neurolens.optics.analysis import layout
@@ -19,6 +18,7 @@ from neurolens.optics.analysis.plots import FIELD_COLOURS, INK, drawing, plain_l
 from neurolens.optics.lens.prescription import Lens
 from neurolens.studies.pages import Record, ns_text, number
 from neurolens.studies.rays import Illumination
+from neurolens.studies.records import NOISY, noisy, pareto_front, time_of
 
 # Names, Okabe and Ito's colours, and markers, which tell kinds apart without colours; black is the exact tracer's.
 Kinds = Mapping[str, tuple[str, str, str]]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError, NeurolensError, pip_install
 from neurolens.base.progress import Report
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.base.status import DOMAIN_SLACK
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera, FloatArray

@@ -21,7 +21,6 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
-from neurolens.base.records import ExactRecord, Timing, break_even_rays
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import Pinhole, ThinLens
 from neurolens.cameras.model import OnnxLens, load_model
@@ -40,6 +39,7 @@ from neurolens.optics.setting.pupils import camera_rays
 from neurolens.optics.trace.rays import Traced, trace
 from neurolens.optics.trace.tracegraph import exact_graph
 from neurolens.studies.rays import frame_width_mm
+from neurolens.studies.records import ExactRecord, Timing, break_even_rays
 
 # Rays of one pass: every batch size divides their number, and a pass's float32 inputs stay in the third-level cache.
 POOL = 65536

@@ -37,8 +37,7 @@ from neurolens.base.files import (
 )
 from neurolens.base.html import html_parts
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain, versions
-from neurolens.base.report import Report, csv_text
+from neurolens.base.report import Report, csv_text, plain
 from neurolens.base.settings import LIGHT_NM
 from neurolens.base.tasks import Failed, failure, run_each
 from neurolens.cameras.model import load_model
@@ -60,6 +59,7 @@ from neurolens.studies.experiment import DomainChoice
 from neurolens.studies.measure import CARD_KEYS, fit_and_measure, fresh_rays
 from neurolens.studies.pages import DASH, Column, flat, table
 from neurolens.studies.plots import layout_profile
+from neurolens.studies.records import versions
 
 SCHEMA = 1
 # A lens that was read is "ok" or "doubtful"; a file that was not read is "refused", or has met a "fault" of neurolens.

@@ -14,7 +14,6 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
-from neurolens.base.records import Results, reaches, target_record, versions, write_results
 from neurolens.cameras.model import load_model
 from neurolens.models.export import export_states
 from neurolens.models.fit import NETWORKS, ModelSettings, Prepared, StateSettings, StateSpace, fit_states, prepare
@@ -38,6 +37,7 @@ from neurolens.studies.measure import (
 from neurolens.studies.pages import CLOSE_UM, exact_of, to_use, write_report
 from neurolens.studies.plots import illumination_plot, layout_profile, states_plot, trade_plot
 from neurolens.studies.rays import Illumination, pixel_um, relative_illumination
+from neurolens.studies.records import Results, reaches, target_record, versions, write_results
 from neurolens.studies.speed import (
     EXACT,
     Race,

@@ -15,11 +15,11 @@ from report_results import Page, full_results
 
 from experiments.__main__ import main as experiment
 from experiments.data import library_pages as library
-from neurolens.base import records
 from neurolens.base.errors import InputError
 from neurolens.base.html import local_url
-from neurolens.base.records import Results, break_even_rays, pareto_front
+from neurolens.studies import records
 from neurolens.studies.pages import write_report
+from neurolens.studies.records import Results, break_even_rays, pareto_front
 
 
 def test_break_even_is_where_the_total_times_meet() -> None:

@@ -39,12 +39,12 @@ from experiments.pictures.gallery.settings import Effect, find_effects, read_eff
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.base.records import versions
 from neurolens.optics.analysis.plots import new_figure, style
 from neurolens.pictures.render.colour import linear_to_srgb
 from neurolens.pictures.render.renderer import render
 from neurolens.pictures.render.scene import load_scene
 from neurolens.studies.plots import rounded_up
+from neurolens.studies.records import versions
 from neurolens.studies.scenes import Image
 
 SCHEMA = 1

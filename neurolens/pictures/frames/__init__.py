@@ -25,7 +25,7 @@ from neurolens.base.errors import InputError, NeurolensError, reason, warn
 from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.base.settings import setting, setting_of, whole, with_changes
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray

@@ -26,7 +26,7 @@ from PIL import Image
 from neurolens import __version__
 from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_path, open_regular
-from neurolens.base.records import plain
+from neurolens.base.report import plain
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
 from neurolens.pictures.render.colour import (

@@ -15,11 +15,11 @@ import onnx
 import pytest
 from report_results import full_results
 
-from neurolens.base.records import Results
 from neurolens.cli import main
 from neurolens.models.card import CARD_KEY
 from neurolens.pictures.render.pictures import write_exr, write_png
 from neurolens.studies.pages import write_report
+from neurolens.studies.records import Results
 
 ROOT = Path(__file__).parents[3]
 RUN = "window.__pwned = 1"

@@ -1,20 +1,18 @@
 """The records of a run, as `results.json` has them. Their keys end in units; shares are fractions of 1.
 
-What was not measured is absent or null, never a made-up number. For infinity and NaN see `plain`.
+What was not measured is absent or null, never a made-up number. For infinity and NaN see `base.report.plain`.
 """
 
 import math
 import platform
-import shlex
-import shutil
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict
 
 from neurolens.base.files import write_json
+from neurolens.base.report import plain
 
 SCHEMA_VERSION = 1
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
@@ -111,35 +109,6 @@ def write_results(path: str | Path, results: Results) -> None:
     write_json(path, {"schema_version": SCHEMA_VERSION, **plain(asdict(results))})
 
 
-def plain(value: Any, strict: bool = True, full: bool = True) -> Any:
-    """Return `value` in JSON's own types: scalars and arrays of numpy and torch become numbers and lists, paths text.
-
-    A dataclass becomes a mapping of its fields; fields in bulk are in it only if `full` asks for them (`base.report`).
-
-    Infinity becomes the text "infinity" or "-infinity" and NaN null; unless `strict` both stay floats. In a path that
-    is no UTF-8, the bytes that are no letters become \\u and four digits.
-    """
-    if isinstance(value, Mapping):
-        return {str(key): plain(item, strict, full) for key, item in value.items()}
-    if is_dataclass(value):
-        found: dict[str, Any] = {}
-        for f in fields(value):
-            item = getattr(value, f.name)
-            if (full or "bulk" not in f.metadata) and not (item is None and "optional" in f.metadata):
-                item = plain(item, strict, full)
-                found |= item if "part" in f.metadata else {f.name: item}
-        return found
-    if hasattr(value, "tolist"):
-        return plain(value.tolist(), strict)
-    if isinstance(value, list | tuple):
-        return [plain(item, strict, full) for item in value]
-    if strict and isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
-    if value is None or isinstance(value, bool | int | float):
-        return value
-    return str(value).encode("utf-8", "backslashreplace").decode()
-
-
 def break_even_rays(
     fit_s: float | None, load_s: float | None, ns_exact: float | None, ns_model: float | None
 ) -> float | None:
@@ -174,14 +143,6 @@ def error_of(record: Mapping[str, Any]) -> tuple[float, float]:
     """Return a sort key: the error in micrometres, or the angle where all rays lie beyond 60 degrees."""
     found = (record.get("rms_um"), record.get("direction_rms_deg"))
     return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
-
-
-def program() -> str:
-    """Return how a command line begins here: "neurolens" if it is on the PATH, else the words that began this one."""
-    if shutil.which("neurolens"):
-        return "neurolens"
-    started = sys.argv[0]
-    return shlex.quote(started) if Path(started).name == "neurolens" else f"{shlex.quote(sys.executable)} -m neurolens"
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
