@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base.progress import Progress
+from neurolens.cameras.contract import FloatArray
 from neurolens.optics.lens.designs import coated
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.flare.job import axis_irradiance
 from neurolens.pictures.flare.lights import front_sphere
 from neurolens.pictures.flare.photons import Photons, PhotonTracer
-from neurolens.pictures.flare.steps import Floats
 from neurolens.pictures.render.settings import Scatter
 
 LENS, HALF_MM = "laikin_double_gauss_50", (18.0, 12.0)
@@ -81,10 +81,10 @@ def contrast_of(lens: Lens, coating: str, count: int) -> Iterator[lab.Row]:
             yield about | {"veil": veil, "error": math.sqrt(square) * per, "kept": 1 / (1 + 2 * veil)}
 
 
-def _flare(tracer: PhotonTracer, rays: Floats, nm: float, seed: int) -> Iterator[Floats]:
+def _flare(tracer: PhotonTracer, rays: FloatArray, nm: float, seed: int) -> Iterator[FloatArray]:
     """Weights of photons in the middle: first of those that surfaces alone reflect, then of those that scatter."""
 
-    def middle(found: Photons, which: NDArray[np.bool_]) -> Floats:
+    def middle(found: Photons, which: NDArray[np.bool_]) -> FloatArray:
         return found.weight[which & (np.hypot(*found.film_xy_mm) < _WITHIN_MM)]
 
     turned = tracer.trace(rays, nm, seed=seed, boost=tracer.turning(nm, 2))
@@ -94,7 +94,7 @@ def _flare(tracer: PhotonTracer, rays: Floats, nm: float, seed: int) -> Iterator
         yield middle(found, found.scattered > 0)
 
 
-def surround_rays(lens: Lens, widest: float, count: int, seed: int) -> tuple[Floats, float]:
+def surround_rays(lens: Lens, widest: float, count: int, seed: int) -> tuple[FloatArray, float]:
     """Rays [6, count] of radiance 1 from all directions within an angle (rad) of the axis through the sphere about the
     front surface, and the light of all together, mm^2 sr."""
     chances = np.random.default_rng([seed, 17]).random((4, count))

@@ -17,11 +17,11 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
 from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.trace.surfaces import UNIT_SLACK
 
 Array = NDArray[np.float64]
 
 # How far a direction's squared length may be from 1: a poor network may decode none, and then there is no ray.
-UNIT_SLACK = 1e-3
 # Areas (mm^2) below this count as none: the outline at the end of the light.
 _NO_AREA = 1e-30
 # Outputs of a lens's graph with derivatives by the film point, in its x and its y.

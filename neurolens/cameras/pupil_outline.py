@@ -145,9 +145,9 @@ _COARSE_LATTICE = (40, 20)
 
 # Tells whether light of a wavelength in nm passes from film points through pupil points, [2, N] in mm each: bool [N].
 Passes = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
-Float64Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 # Tells whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
-PassTest = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
+PassTest = Callable[[Array, Array], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -192,16 +192,16 @@ class SearchFrame(NamedTuple):
         reach: the farthest distance in the stretched frame.
     """
 
-    radius: Float64Array
-    centre: Float64Array
-    stretch: Float64Array
-    reach: Float64Array
+    radius: Array
+    centre: Array
+    stretch: Array
+    reach: Array
 
 
 def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
     """Return a test whether rays pass at any of the wavelengths."""
 
-    def passing(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
+    def passing(radius: Array, points: Array) -> NDArray[np.bool_]:
         film = np.zeros(points.shape, np.float32)
         film[0] = radius
         rays = np.concatenate([film, points]).reshape(4, -1).astype(np.float32)
@@ -218,7 +218,7 @@ def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     """Return the largest film radius, within those of the table, from which a ray is found to pass."""
     last = table.rows.shape[1] - 1
 
-    def light(boxes: Float64Array, place: Float64Array) -> Float64Array:
+    def light(boxes: Array, place: Array) -> Array:
         """Search given boxes at fractional rows, and return boxes [3, M] about the rays that pass."""
         return _lattice(boxes, table.film_radius_mm * place / last, passing).boxes
 
@@ -237,7 +237,7 @@ def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     return float(table.film_radius_mm * lit[0] / last) if lit[0] > 0 else None
 
 
-def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
+def _boxes(table: PupilTable, place: Array) -> Array:
     """Return low, high and half width [3, M] of boxes that hold what passes at fractional rows of the table."""
     low, high, half = table.rows.astype(np.float64)
     empty = low > high
@@ -250,14 +250,12 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
 class _Found(NamedTuple):
     """What passes of lattices: boxes [3, M] about it, a step wider (low > high if none does), and its mean along x."""
 
-    boxes: Float64Array
-    centre: Float64Array
+    boxes: Array
+    centre: Array
 
 
 @np.errstate(over="ignore", invalid="ignore")  # nothing passes of empty boxes, nor of those near float32's end
-def _lattice(
-    boxes: Float64Array, radius: Float64Array, passing: PassTest, size: tuple[int, int] = _COARSE_LATTICE
-) -> _Found:
+def _lattice(boxes: Array, radius: Array, passing: PassTest, size: tuple[int, int] = _COARSE_LATTICE) -> _Found:
     """Test lattices of points on boxes [3, M] from film radii [M]."""
     low, high, half = boxes
     u, v = ((np.arange(n) + 0.5) / n for n in size)
@@ -272,7 +270,7 @@ def _lattice(
     return _Found(np.where(passed.any((1, 2)), [left - step, right + step, top + rise], [[1], [-1], [0]]), centre)
 
 
-def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> SearchFrame:
+def frame_of(table: PupilTable, radius: Array, passing: PassTest) -> SearchFrame:
     """Return the centroid and extent of what passes at each film radius, from a lattice."""
     place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
     boxes, centre = _lattice(_boxes(table, place), radius, passing)
@@ -380,9 +378,7 @@ def outline_of(
     return _pushed_out(pushed, passes, detail.wavelengths, lambda share: report(0.6 + 0.4 * share))
 
 
-def _boundary(
-    passing: PassTest, frame: SearchFrame, angles: Float64Array, reach: Float64Array, steps: int, halvings: int
-) -> Float64Array:
+def _boundary(passing: PassTest, frame: SearchFrame, angles: Array, reach: Array, steps: int, halvings: int) -> Array:
     """Return the distance [R, D] from the centre to the last passing point in each direction, in the stretched frame.
 
     It is searched within `reach` [R, D], by so many steps and halvings of the last.
@@ -393,9 +389,7 @@ def _boundary(
     return flat.reshape(angles.shape)
 
 
-def _flat(
-    radius: Float64Array, centre: Float64Array, direction: Float64Array
-) -> tuple[Float64Array, Float64Array, Float64Array]:
+def _flat(radius: Array, centre: Array, direction: Array) -> tuple[Array, Array, Array]:
     """Return film radius [M], origin and direction [2, M] of all directions [2, R, D] from the centres of rows."""
     count = direction.shape[2]
     origin = np.stack([np.repeat(centre, count), np.zeros(centre.size * count)])
@@ -404,12 +398,12 @@ def _flat(
 
 def _farthest(
     passing: PassTest,
-    radius: Float64Array,
-    origin: Float64Array,
-    direction: Float64Array,
-    steps: Float64Array,
+    radius: Array,
+    origin: Array,
+    direction: Array,
+    steps: Array,
     halvings: int,
-) -> Float64Array:
+) -> Array:
     """Return the largest t [M] at which origin + t direction passes, to the last halving and never less.
 
     Args:
@@ -434,7 +428,7 @@ def _farthest(
     return low
 
 
-def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) -> Float64Array:
+def _equal_areas(angles: Array, distance: Array, segments: int) -> Array:
     """Return angles [R, segments + 1] between which the outline, given by its distance at `angles`, has equal areas."""
     wedges = distance[:, 1:] * distance[:, :-1] + 1e-9
     area = np.concatenate([np.zeros((len(angles), 1)), np.cumsum(wedges, axis=1)], axis=1)
@@ -442,7 +436,7 @@ def _equal_areas(angles: Float64Array, distance: Float64Array, segments: int) ->
     return np.stack([np.interp(wanted * a[-1], a, t) for a, t in zip(area, angles, strict=True)])
 
 
-def _together(distance: Float64Array, shares: tuple[float, ...]) -> Float64Array:
+def _together(distance: Array, shares: tuple[float, ...]) -> Array:
     """Return distances at both ends of the spectrum, from those [W, R, D] at shares of it.
 
     Where the distances of a row differ much, both ends get the largest.
@@ -476,15 +470,13 @@ def _pushed_out(
     return replace(outline, x=outline.x * scale, y=outline.y * scale)
 
 
-def _excess(
-    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], passing: PassTest
-) -> list[tuple[float, Float64Array]]:
+def _excess(outline: PupilOutline, vertices: tuple[Array, Array], passing: PassTest) -> list[tuple[float, Array]]:
     """Return how far passing rays reach between rows and vertices, as shares [rows, edges] of the outline.
 
     Each comes with its place's part of the step between rows.
     """
 
-    def between(c: Float64Array, step: float) -> Float64Array:
+    def between(c: Array, step: float) -> Array:
         return (1 - step) * c[:-1] + step * c[1:] if step else c
 
     centres, rows = outline.centre.astype(np.float64), np.arange(outline.centre.size, dtype=np.float64)
@@ -539,7 +531,7 @@ def leaning(outline: PupilOutline, passes: Passes, reach: float) -> PupilOutline
     return replace(outline, x=outline.x * wider, y=outline.y * wider, lean=lean.astype(np.float32))
 
 
-def _keep_largest(needed: Float64Array, found: Float64Array, step: float) -> None:
+def _keep_largest(needed: Array, found: Array, step: float) -> None:
     """Raise the needs of vertices [..., R, K + 1] to what was found [rows, edges] beside them.
 
     `step` is the place between rows at which it was found.

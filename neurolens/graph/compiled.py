@@ -15,7 +15,7 @@ from neurolens.graph.ir import Graph
 from neurolens.graph.program import Program, row_names
 from neurolens.graph.scalars import lower
 
-Floats = NDArray[np.float32]
+FloatArray = NDArray[np.float32]
 # Programs of more steps are not compiled. gcc 12 takes 48 s for 7100 steps in one loop, and its time grows faster than
 # their number; in parts (`PartWriter`) 20 s for 18,000: the gradients of an exact lens of 56 refractions.
 MAX_STEPS, MAX_STEPS_IN_PARTS = 12_000, 24_000
@@ -36,7 +36,7 @@ class CompiledGraph:
     """
 
     def __init__(
-        self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: Floats | None = None
+        self, program: Program, rows: Mapping[str, int], numbers: dict[str, float], table: FloatArray | None = None
     ) -> None:
         most = MAX_STEPS_IN_PARTS if program.waits() else MAX_STEPS
         if len(program.steps) > most:
@@ -51,12 +51,14 @@ class CompiledGraph:
         self._call.restype = None
 
     @classmethod
-    def of(cls, graph: Graph, numbers: dict[str, float], table: Floats | None = None) -> Self:
+    def of(cls, graph: Graph, numbers: dict[str, float], table: FloatArray | None = None) -> Self:
         """Compile the program of a graph."""
         rows = {name: value.rows for name, value in graph.outputs.items()}
         return cls(lower(graph).in_order_of_need(), rows, numbers, table)
 
-    def __call__(self, rays: dict[str, Floats], into: Mapping[str, Floats] | None = None) -> dict[str, NDArray[Any]]:
+    def __call__(
+        self, rays: dict[str, FloatArray], into: Mapping[str, FloatArray] | None = None
+    ) -> dict[str, NDArray[Any]]:
         """Return the results [R, N] for inputs [R, N]; those in `into` are written there."""
         found = self.room(next(iter(rays.values())).shape[1], into or {})
         self.prepared(rays, found)()
@@ -67,7 +69,7 @@ class CompiledGraph:
         missing = {name: shape for name, shape in self.rows.items() if name not in given}
         return {**given, **{name: np.empty((rows, count), kind) for name, (rows, kind) in missing.items()}}
 
-    def prepared(self, rays: Mapping[str, Floats], found: Mapping[str, NDArray[Any]]) -> Callable[[], object]:
+    def prepared(self, rays: Mapping[str, FloatArray], found: Mapping[str, NDArray[Any]]) -> Callable[[], object]:
         """Return a call that computes the results of rays into their arrays, all of which stay in place until then."""
         places: dict[str, int] = {}
         for name, array in (*rays.items(), *found.items()):

@@ -23,7 +23,7 @@ from neurolens.graph.interpret import monomials as monomials
 from neurolens.models.cores import LightField
 
 Exponents = NDArray[np.int64]
-Floats = NDArray[np.float64]
+Array = NDArray[np.float64]
 Rule = Literal["omp", "ols"]
 # A candidate of which less than this share is left after orthogonalisation is a combination of the chosen ones.
 DEPENDENT = 1e-11
@@ -149,7 +149,7 @@ class Sweep:
     Several problems with the same candidates may be `joined`: all choose the same, by the sum of their residuals.
     """
 
-    def __init__(self, gram: Floats, moments: Floats, squares: Floats) -> None:
+    def __init__(self, gram: Array, moments: Array, squares: Array) -> None:
         """Take the Gram matrix [M, M], column-output products [M, R] and squared norms of the outputs [R]."""
         self.count, outputs = moments.shape
         norms = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -182,7 +182,7 @@ class Sweep:
         return whole
 
     @property
-    def residuals(self) -> Floats:
+    def residuals(self) -> Array:
         """Return the squared residual [R] of every output, of the first problem."""
         return np.diag(self._tables[0])[self.count :]
 
@@ -220,7 +220,7 @@ class Sweep:
         for k in chosen:
             self.add(k)
 
-    def scores(self, rule: Rule) -> Floats:
+    def scores(self, rule: Rule) -> Array:
         """Return the gain [M] of every candidate: how far it reduces the squared residual.
 
         The gain is exact by the rule "ols"; by "omp" it is the squared correlation with the residual.
@@ -230,7 +230,7 @@ class Sweep:
         scores = np.stack([self._scores(table, rule) for table in self._tables])
         return np.where((scores >= 0).all(0), scores.sum(0), -1.0)
 
-    def _scores(self, table: Floats, rule: Rule) -> Floats:
+    def _scores(self, table: Array, rule: Rule) -> Array:
         left = np.diag(table)[: self.count]
         correlation = (table[: self.count, self.count :] ** 2).sum(1)
         usable = left > np.maximum(DEPENDENT, self._needed(table))
@@ -238,7 +238,7 @@ class Sweep:
         gain = correlation / np.where(usable, left, 1.0) if rule == "ols" else correlation
         return np.where(usable, gain, -1.0)
 
-    def _needed(self, table: Floats) -> Floats | float:
+    def _needed(self, table: Array) -> Array | float:
         """Return how independent each candidate [M] must be, so that with it every chosen column keeps `SPANNED`."""
         if not self.chosen:
             return 0.0
@@ -249,14 +249,14 @@ class Sweep:
         across /= spare[:, None]
         return np.asarray(across.max(0))
 
-    def costs(self) -> Floats:
+    def costs(self) -> Array:
         """Return how much the residual would grow without each chosen column [len(chosen)], of the first problem."""
         t, chosen = self._tables[0], self.chosen
         # The pivot of a column swept in is -1 / (what is left of it beside the others), which is at most all of it.
         return (t[chosen, self.count :] ** 2).sum(1) / np.maximum(-t[chosen, chosen], 0.999)
 
 
-def _sweep(table: Floats, k: int, sign: float) -> None:
+def _sweep(table: Array, k: int, sign: float) -> None:
     """Move a column into (1) or out of (-1) a table, in place."""
     pivot, row, column = table[k, k], table[k].copy(), table[:, k].copy()
     torch.from_numpy(table).addr_(torch.from_numpy(column), torch.from_numpy(row), alpha=-1.0 / pivot)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, warn
 from neurolens.base.settings import LIGHT_NM
-from neurolens.cameras.contract import RAYS_A_CALL, Camera
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.cameras.field import Frame
 from neurolens.cameras.pose import FilmPose
 from neurolens.cameras.sampling import axis_mm
@@ -42,7 +42,6 @@ from neurolens.pictures.render.pictures import (
     read_colour_space,
 )
 
-FloatArray = NDArray[np.float32]
 NUMBERS = 5  # that a ray's line has: ax, ay, bx, by, weight
 MIDDLE_NM = 550.0
 _NODES, _PITCH = 64, 8  # cells along the longer side of the film, and their least size in pixels

@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.cameras.contract import FloatArray
 from neurolens.graph.compiler import c_source, load_compiled
 
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
+Array = NDArray[np.float64]
 CELLS = 8  # along each side of an extended light
 FADE = 8  # parts of a cell's side where patches of a light fade into each other
 LOST = 1e30  # `worst` of a ray that misses a surface, or is totally reflected where it should go on
@@ -38,7 +38,7 @@ _FINE = 12.0  # the fewest pixels that draw the width of a smear
 _FADING = 0.15  # the largest step of light, over the most light, within a patch that fades over 16 parts or more is 0.1
 
 
-def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -> Doubles:
+def edges_of(rays: FloatArray, columns: int, size: tuple[int, int], per_mm: float) -> Array:
     """Return the light of a grid of rays of one wavelength as edges for `draw_edges`; none if it misses the film.
 
     Args:
@@ -55,7 +55,7 @@ def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -
     return edges[: _compiled().edges(columns, rows, *size, per_mm, *pointers)].copy()
 
 
-def draw_edges(picture: Floats, rows: range, edges: Doubles, counts: NDArray[np.int64], light: Doubles) -> None:
+def draw_edges(picture: FloatArray, rows: range, edges: Array, counts: NDArray[np.int64], light: Array) -> None:
     """Add light to some rows of a picture [H, W, 3], centred and upright (the film turned by 180 degrees).
 
     A row comes out the same whether it is drawn by itself or with others.
@@ -122,7 +122,7 @@ class Smear(NamedTuple):
         wide = abs(a * d - b * c) / max(math.hypot(a, b), math.hypot(c, d))
         return 1 << max(0, math.floor(math.log2(wide / cells / _FINE)))
 
-    def kernel(self, most: int, coarse: int = 1) -> Floats:
+    def kernel(self, most: int, coarse: int = 1) -> FloatArray:
         """Return the smear as a kernel [2 H + 1, 2 W + 1] about the middle of its light.
 
         Its sum is 1, less the light beyond `most` pixels, which is cut off.
@@ -155,7 +155,7 @@ class Smear(NamedTuple):
         return np.abs(picture[..., 0])
 
 
-def smear_of(weights: Doubles, disc: bool, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
+def smear_of(weights: Array, disc: bool, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
     """Return the smear of a picture that moves by [2, 2] (right, down) along a patch's sides; None if it hardly moves.
 
     Args:
@@ -174,7 +174,7 @@ def smear_of(weights: Doubles, disc: bool, moved_px: NDArray[np.floating[Any]]) 
     return Smear((float(a[0]), float(a[1]), float(b[0]), float(b[1])), shares, disc)
 
 
-def smeared(picture: Floats, kernel: Floats) -> Floats:
+def smeared(picture: FloatArray, kernel: FloatArray) -> FloatArray:
     """Convolve a picture [H + 2 M, W + 2 N, C] with a kernel [2 M + 1, 2 N + 1]; returns [H, W, C].
 
     It is done in float64: rounding is relative to the brightest pixel, and a millionth of that is seen, too.
@@ -193,7 +193,7 @@ def smeared(picture: Floats, kernel: Floats) -> Floats:
     return whole[down - 1 : height, across - 1 : width]
 
 
-def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
+def enlarged(picture: FloatArray, factor: int, height: int, width: int) -> FloatArray:
     """Enlarge a picture by a factor to pixels [height, width] about its middle, by linear interpolation."""
     if factor == 1:
         return picture
@@ -203,14 +203,14 @@ def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
     return picture
 
 
-def resampled(values: Floats, axis: int, at: Doubles) -> Floats:
+def resampled(values: FloatArray, axis: int, at: Array) -> FloatArray:
     """Return values at places along an axis, linear between the given ones."""
     first = np.floor(at).astype(int)
     part = np.moveaxis((at - first).astype(np.float32).reshape(-1, *[1] * (values.ndim - 1)), 0, axis)
     return values.take(first, axis, mode="clip") * (1 - part) + values.take(first + 1, axis, mode="clip") * part
 
 
-def spread(picture: Floats, radius: float) -> Floats:
+def spread(picture: FloatArray, radius: float) -> FloatArray:
     """Blur a picture [H, W, C] by Epanechnikov's kernel of this radius, mirrored at the edges."""
     reach = min(math.ceil(radius), *picture.shape[:2])
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]

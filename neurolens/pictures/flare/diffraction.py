@@ -30,13 +30,14 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.tasks import in_order
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pose import UPRIGHT
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.pictures.flare.canvas import Raster, resampled, smear_of, smeared
 from neurolens.pictures.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
 from neurolens.pictures.flare.job import FlareJob
-from neurolens.pictures.flare.lights import Floats, Light, patches
+from neurolens.pictures.flare.lights import Light, patches
 from neurolens.pictures.render.colour import in_gamut
 
 _PER_CYCLE = 2.5  # cells a cycle of the field needs
@@ -96,7 +97,7 @@ class Spectrum:
             film, and n with length 1. With M = 0 all rays meet at the centre.
     """
 
-    values: Floats
+    values: FloatArray
     step: float
     edges: Sequence[Array]
 
@@ -110,7 +111,7 @@ class Spectrum:
         return np.maximum(total, 0)
 
 
-def _squares(edges: Array, x_mm: Array, y_mm: Array) -> Floats:
+def _squares(edges: Array, x_mm: Array, y_mm: Array) -> FloatArray:
     """Return |u|^2 [Y, X] of points, each from the element (`Spectrum.edges`) whose light it has."""
     found = np.empty((len(y_mm), len(x_mm)), np.float32)
     between = np.pad((np.diff(edges[:, :2], axis=0) ** 2).sum(1), 1, constant_values=np.inf)
@@ -198,7 +199,7 @@ def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple
     return np.concatenate(places, 1), np.concatenate(normals, 1)
 
 
-def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda share: None) -> Floats:
+def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda share: None) -> FloatArray:
     """Return the stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
 
     The star of a point is 0 where rays make the image itself and at the pixels next to that, because a render has the
@@ -229,7 +230,7 @@ def starburst_picture(job: FlareJob, done: Callable[[float], None] = lambda shar
     return in_gamut(picture)
 
 
-def _on_turned_film(job: FlareJob, done: Callable[[float], None]) -> Floats:
+def _on_turned_film(job: FlareJob, done: Callable[[float], None]) -> FloatArray:
     """Return the stars on a turned film: those of upright films through the images, seen from the exit pupil."""
     from scipy import ndimage  # type: ignore[import-untyped]
 
@@ -266,7 +267,7 @@ def _on_turned_film(job: FlareJob, done: Callable[[float], None]) -> Floats:
     return picture
 
 
-def _stars(job: FlareJob, light: Light, wavelengths_nm: Array, raster: Raster) -> Iterator[Floats]:
+def _stars(job: FlareJob, light: Light, wavelengths_nm: Array, raster: Raster) -> Iterator[FloatArray]:
     """Yield the star of a light at each wavelength: irradiance [H, W] for 1 at the lens; none if it is dark."""
     lens, moved = job.lens, job.pose.moved_mm
     middle = exit_pupil(lens, light, float(wavelengths_nm.mean()))
@@ -278,7 +279,7 @@ def _stars(job: FlareJob, light: Light, wavelengths_nm: Array, raster: Raster) -
     y = (np.arange(raster.height) + 0.5 - raster.height / 2) * pixel - moved[1]
     reach = max(float(np.abs(p - c).max()) for p, c in zip((x, y), middle.centre_mm, strict=True))
 
-    def one(nm: float, far: Spectrum) -> Floats:
+    def one(nm: float, far: Spectrum) -> FloatArray:
         pupil = exit_pupil(lens, light, float(nm), middle)
         if pupil is None:
             return np.zeros((raster.height, raster.width), np.float32)
@@ -292,7 +293,7 @@ def _stars(job: FlareJob, light: Light, wavelengths_nm: Array, raster: Raster) -
         yield from in_order(job.threads, partial(one, far=far), part)
 
 
-def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: Array, pixel_mm: float) -> Floats:
+def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: Array, pixel_mm: float) -> FloatArray:
     """Return the mean irradiance [Y, X] of pixels at x and y, mm from the pupil's centre, for 1 at the lens.
 
     It is 0 at the image itself and next to it.

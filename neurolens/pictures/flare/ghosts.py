@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.compiler import c_source
 from neurolens.graph.ir import Graph, Value
@@ -29,7 +30,7 @@ from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.rays import Rays, follow, turning
 from neurolens.pictures.flare.lights import Light, light_rays
-from neurolens.pictures.flare.steps import CALL, LOST, STATE, Floats, Stack, entering, film_graph, reflects, step_graph
+from neurolens.pictures.flare.steps import CALL, LOST, STATE, Stack, entering, film_graph, reflects, step_graph
 
 RANKED = 4096  # rays from which a table has a ghost's energy
 _BLOCK = 512  # rays at a time: their states, 32 bytes before every surface, fit the second cache
@@ -71,20 +72,20 @@ class GhostRays(NamedTuple):
         rows: [P, 4, N] x and y on the film (mm), power and worst.
     """
 
-    rows: Floats
+    rows: FloatArray
 
     @property
-    def film_xy_mm(self) -> Floats:
+    def film_xy_mm(self) -> FloatArray:
         """The film points [P, 2, N]."""
         return self.rows[:, :2]
 
     @property
-    def power(self) -> Floats:
+    def power(self) -> FloatArray:
         """The share [P, N] of a ray's light that arrives; 0 where any rim stops the ray."""
         return self.rows[:, 2]
 
     @property
-    def worst(self) -> Floats:
+    def worst(self) -> FloatArray:
         """The largest r^2 / R^2 at any rim on the way, [P, N]: at most 1 where the ray arrives."""
         return self.rows[:, 3]
 
@@ -118,7 +119,7 @@ class GhostTracer:
         whole, pointer = ctypes.c_int, ctypes.c_void_p
         self._call.argtypes = [ctypes.c_size_t, whole, whole, ctypes.c_float, *[pointer] * 7]
 
-    def trace(self, rays: Floats, wavelength_nm: float, *, direct: bool = False) -> GhostRays:
+    def trace(self, rays: FloatArray, wavelength_nm: float, *, direct: bool = False) -> GhostRays:
         """Follow light [6, N] (point in mm and unit direction towards the film, lens frame) along every ghost.
 
         Args:
@@ -128,7 +129,7 @@ class GhostTracer:
 
     def follow(
         self,
-        start: Floats,
+        start: FloatArray,
         wavelength_nm: float,
         *,
         only: Sequence[Pair] | None = None,
@@ -153,7 +154,9 @@ class GhostTracer:
         self._call(start.shape[1], surfaces, len(rows), reach, *(a.ctypes.data for a in arrays))
         return GhostRays(out)
 
-    def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
+    def follow_each(
+        self, start: FloatArray, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0
+    ) -> FloatArray:
         """Follow rays of `entering` along one ghost at several wavelengths, [W, 4, N]; rows as in `GhostRays`."""
         return np.concatenate([self.follow(start, nm, only=[pair], reach=reach).rows for nm in wavelengths_nm])
 
@@ -308,7 +311,9 @@ def ghost_graphs(lens: Lens, pairs: Sequence[Pair], wavelength_nm: tuple[float, 
     return [_graph(stack, pair, numbers, nodes, stack.numbers(at[0])[1], (short, long)) for pair in pairs]
 
 
-def _graph(stack: Stack, pair: Pair, numbers: Array, nodes: Array, film: Floats, w_range: tuple[float, float]) -> Graph:
+def _graph(
+    stack: Stack, pair: Pair, numbers: Array, nodes: Array, film: FloatArray, w_range: tuple[float, float]
+) -> Graph:
     g, (first, second), (short, long) = Graph(), pair, w_range
     rays, radius = g.input("entering", 5), g.input("stop_radius_mm", per_call=True)
     inverse_um = 1000.0 / rays[4]

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from neurolens.base.report import some_of
 from neurolens.base.settings import LIGHT_NM
+from neurolens.cameras.contract import FloatArray
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair
 from neurolens.pictures.flare.lights import Light, Patch, light_towards, rays_across
-from neurolens.pictures.flare.steps import LOST, Floats, entering
+from neurolens.pictures.flare.steps import LOST, entering
 
 Array = NDArray[np.float64]
 # Lit cells, at least, which leave up to 4% of the light of a ghost of many layers wrong; cells along a side, at most.
@@ -186,7 +187,11 @@ class _Look(NamedTuple):
 
 
 def _look(
-    kept: NDArray[np.bool_], rows: Floats, colours: tuple[Any, ...], nm: Sequence[float], half_mm: tuple[float, float]
+    kept: NDArray[np.bool_],
+    rows: FloatArray,
+    colours: tuple[Any, ...],
+    nm: Sequence[float],
+    half_mm: tuple[float, float],
 ) -> _Look:
     """Measure a ghost: cells that are kept, rows [4, N] of its scouts, and `_colours` at its wavelengths."""
     x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
@@ -220,7 +225,7 @@ def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray
     return of(a[1:], a[:-1]) if axis == 0 else of(a[:, 1:], a[:, :-1])
 
 
-def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Array, Array, Array]:
+def _colours(each: Sequence[FloatArray], half_mm: tuple[float, float]) -> tuple[Array, Array, Array]:
     """Measure how ghosts differ by the wavelength, from the rows [P, 4, N] of their rays at each of W wavelengths.
 
     The first array [P] is how far (mm) each ghost moves from the first to the last wavelength; inf for a ghost without
@@ -249,7 +254,7 @@ def _colours(each: Sequence[Floats], half_mm: tuple[float, float]) -> tuple[Arra
     return moved, np.asarray(swept), np.cumprod(ratios, 0).T.astype(np.float64)
 
 
-def _kept(rows: Floats, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
+def _kept(rows: FloatArray, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
     """Return whether light of each cell may reach the film, [P, S, S], from the rows [P, 4, N] of the scouts.
 
     A cell whose corners are all stopped by a rim is kept where `worst`, extrapolated by its change in the cell, reaches

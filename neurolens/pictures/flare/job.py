@@ -15,7 +15,7 @@ from neurolens.cameras.exact import light_on_axis
 from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.rays import Rays, Traced, trace
-from neurolens.pictures.flare.canvas import Doubles, Raster
+from neurolens.pictures.flare.canvas import Array, Raster
 from neurolens.pictures.flare.ghosts import GhostTracer
 from neurolens.pictures.flare.lights import Light, disc
 from neurolens.pictures.render.colour import SpectralRange
@@ -77,7 +77,7 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     film_z = lens.film_z_mm
     assert film_z is not None  # a tracer's lens has one
 
-    def traced(sines: Doubles, power: bool) -> Traced:
+    def traced(sines: Array, power: bool) -> Traced:
         d = torch.from_numpy(np.stack([*sines, -np.sqrt(1 - (sines**2).sum(0))]))
         zero = torch.zeros_like(d[0])
         return trace(lens, Rays(zero, zero, zero + film_z, *d), wavelength_nm, transmittance=power)

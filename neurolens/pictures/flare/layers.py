@@ -19,12 +19,13 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import Kept
 from neurolens.base.progress import Progress, Report
 from neurolens.base.tasks import in_order
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pose import FilmPose
 from neurolens.optics.lens.glass import inverse_square_um
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens
 from neurolens.pictures.flare import canvas
-from neurolens.pictures.flare.canvas import Doubles, Floats, Raster, Smear
+from neurolens.pictures.flare.canvas import Array, Raster, Smear
 from neurolens.pictures.flare.diffraction import starburst_picture
 from neurolens.pictures.flare.ghosts import GhostTracer, Pair, ghost_pairs
 from neurolens.pictures.flare.grids import REACH, Grid, ghost_moves, grids_of
@@ -54,7 +55,7 @@ _BEGUN, _SMEARED = 14_000, 0.45  # in the time of a cell: to begin a group of gh
 _MUCH, _TRIALS = 1e7, 6  # cells that take seconds; groups whose time is measured before such work
 # shares: of a ghost's light that may come or go over a patch; of all light, below which a ghost is faint
 _UNEVEN, _FAINT = 0.6, 5e-4
-Layers = dict[str, Floats]
+Layers = dict[str, FloatArray]
 REST = "rest"
 
 
@@ -65,7 +66,7 @@ class _Task(NamedTuple):
     pair: Pair
     grid: Grid
     wavelengths_nm: list[float]
-    colours: Doubles
+    colours: Array
 
     @property
     def work(self) -> int:
@@ -77,7 +78,7 @@ def _quietly(fraction: float, seconds_left: float | None = None) -> None:
     """Report nothing."""
 
 
-def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) -> Iterator[tuple[int, Floats]]:
+def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) -> Iterator[tuple[int, FloatArray]]:
     """Yield the number and the picture [H, W, 3] (linear sRGB) of each layer that has light.
 
     Each ghost is drawn as the areas of a grid of rays (`pictures.flare.canvas`). Where a ghost's colours hardly part,
@@ -102,7 +103,7 @@ def ghost_layers(job: FlareJob, layers: Sequence[int], done: Report = _quietly) 
     ordered = [_Group(*key, tasks) for key, tasks in groups.items()]
     whole, expected = max(sum(group.work(raster) for group in ordered), 1.0), _expected_s(job, ordered)
     done(0.0, expected)
-    began, worked, pictures = time.perf_counter(), 0.0, dict[int, Floats]()
+    began, worked, pictures = time.perf_counter(), 0.0, dict[int, FloatArray]()
     for number in sorted({group.layer for group in ordered}):
         pictures.clear()
         for group in (group for group in ordered if group.layer == number):
@@ -133,7 +134,7 @@ class _Group(NamedTuple):
         return _BEGUN + smeared + sum(task.work for task in self.tasks)
 
 
-def _add(job: FlareJob, group: _Group, picture: Floats) -> Iterator[float]:
+def _add(job: FlareJob, group: _Group, picture: FloatArray) -> Iterator[float]:
     """Add a group of ghosts to a picture of its size, ghost by ghost; yields the work done since the last one."""
     raster, kernel, drawing = job.raster, None, picture
     if group.smear is not None:
@@ -164,7 +165,7 @@ def _expected_s(job: FlareJob, groups: Sequence[_Group]) -> float | None:
 
 def _parts(
     job: FlareJob, tracer: GhostTracer, light: Light, nm: Sequence[float]
-) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
+) -> Iterator[tuple[Patch, Pair, Grid, Array]]:
     """Yield the patches of a light, and the ghosts of each with their grids and moves.
 
     A ghost that rims cut differently over a patch, so that much of its light comes or goes, has finer patches.
@@ -174,7 +175,7 @@ def _parts(
     efl, needs = abs(float(first_order(tracer.lens).efl_mm)), dict.fromkeys(tracer.pairs, _PATCHES[0])
     for most in _PATCHES:
         pairs = [pair for pair in tracer.pairs if needs[pair] == most]
-        found, sums = list[tuple[Patch, Pair, Grid, Doubles]](), dict.fromkeys(pairs, np.zeros(2))
+        found, sums = list[tuple[Patch, Pair, Grid, Array]](), dict.fromkeys(pairs, np.zeros(2))
         for patch in patches(light, _PATCH_DEG * _PATCHES[0] / most, most) if pairs else ():
             size = 1.5 * float(np.abs(patch.sides).sum()) * efl
             around = half_mm[0] + size, half_mm[1] + size  # a smear may bring ghosts in from beside the film
@@ -191,13 +192,15 @@ def _parts(
         yield from (part for part in found if needs[part[1]] == most)
 
 
-def _draw(tracer: GhostTracer, tasks: Sequence[_Task], picture: Floats, per_mm: float, threads: int) -> Iterator[float]:
+def _draw(
+    tracer: GhostTracer, tasks: Sequence[_Task], picture: FloatArray, per_mm: float, threads: int
+) -> Iterator[float]:
     """Add ghosts to a picture with `per_mm` pixels per mm; yields the work done each time."""
     height, width, _ = picture.shape
     high = max(1, _STRIP // (32 * width))
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
-    def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
+    def edges(task: _Task) -> tuple[list[Array], Array]:
         """Return the edges of each wavelength's cells, and the light of the cells."""
         rays, area = rays_across(tracer.lens, task.light, task.grid.places)
         rows = tracer.follow_each(entering(rays), task.wavelengths_nm, task.pair, REACH)
@@ -230,7 +233,7 @@ def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
         yield batch
 
 
-def _bands(nm: Doubles, response: Doubles, grid: Grid, most: int) -> tuple[list[float], Doubles]:
+def _bands(nm: Array, response: Array, grid: Grid, most: int) -> tuple[list[float], Array]:
     """Choose at most `most` wavelengths that stand for all of `nm` [W] in a ghost.
 
     They come with colours [K, 3], from responses [W, 3].
@@ -248,7 +251,7 @@ def _bands(nm: Doubles, response: Doubles, grid: Grid, most: int) -> tuple[list[
     )
     nodes, level = zip(*(grid.spectrum or ((nm[0], 1.0),)), strict=True)
     power = np.interp(nm, nodes, np.maximum(level, 1e-3 * max(level) + 1e-30))
-    traced, colours = list[float](), list[Doubles]()
+    traced, colours = list[float](), list[Array]()
     for band in (np.flatnonzero(at == k) for k in np.unique(at)):
         chosen = float(np.average(nm[band], weights=np.abs(response[band]).sum(1) + 1e-30))
         if 2 * np.interp(chosen, nm, power) < power[band].mean():
@@ -268,7 +271,7 @@ PARTS: dict[str, Callable[[Photons], NDArray[np.bool_]]] = {
 }
 
 
-def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quietly) -> Floats:
+def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quietly) -> FloatArray:
     """Return the photons of lights on the film as a picture, [H, W, 3] linear sRGB, by density estimation.
 
     Args:
@@ -293,7 +296,7 @@ def photon_picture(job: FlareJob, part: str, photons: int, done: Report = _quiet
         if done_before in range(len(whole) + 1) and [a.shape for a in arrays] == [picture.shape, sums.shape]:
             begun, (picture, sums) = done_before, arrays
 
-    def one(task: tuple[int, Light, int, int]) -> tuple[Floats, float]:
+    def one(task: tuple[int, Light, int, int]) -> tuple[FloatArray, float]:
         """Return the sums of weights and of their squares, [2, H, W], and the area of the light."""
         number, light, k, first = task
         shift = (k / count + settings.seed * _GOLDEN % 1) % 1
@@ -329,8 +332,8 @@ def kept_file(picture: Path, part: str) -> Path:
 
 
 def _arrivals(
-    tracer: PhotonTracer, part: str, rays: Floats, wavelength_nm: float, most_reflections: int, seed: int
-) -> Iterator[tuple[Floats, Floats]]:
+    tracer: PhotonTracer, part: str, rays: FloatArray, wavelength_nm: float, most_reflections: int, seed: int
+) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield places on the film [2, M] (mm) and weights [M] of the photons of a part."""
     # Surfaces reflect so little that photons are made to turn round. Those that scatter, and the image, are not.
     times = {"ghosts": (2,), "glare": (LEVELS - 1, 0), "flare": (2, 0)}.get(part, (0,))
@@ -344,7 +347,7 @@ def _arrivals(
         yield photons.film_xy_mm[:, which], photons.weight[which] / (1 - tracer.scatter.sensor)
 
 
-def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
+def _smoothed(picture: FloatArray, sums: FloatArray, radius: float) -> FloatArray:
     """Smooth a picture [H, W, 3] of photons: its luminance by kernels of `radius` or more, its colour by wider ones."""
     wide = min(picture.shape[:2])
     bright = in_gamut(_spread_wide(picture, sums, radius, _ENOUGH, wide / 8))
@@ -353,7 +356,7 @@ def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
     return coloured * (luminance[0] / luminance[1])
 
 
-def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int, widest: float) -> Floats:
+def _spread_wide(picture: FloatArray, sums: FloatArray, radius: float, enough: int, widest: float) -> FloatArray:
     """Spread the light of a picture [H, W, 3] by kernels that keep its sum, mirrored at the edges.
 
     Each pixel takes the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight. Photons of
@@ -444,7 +447,7 @@ def scene_flare(
     return {name: picture @ matrix for name, picture in flare_layers(job, progress).items()}
 
 
-def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
+def sum_of(layers: Mapping[str, FloatArray], raster: Raster) -> FloatArray:
     """Return the whole flare, [H, W, 3]: the layers of `MAKERS`, without their parts."""
     none = np.zeros((raster.height, raster.width, 3), np.float32)
     return sum((layers[name] for name in MAKERS if name in layers), none)

@@ -25,7 +25,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.field import Array, Field
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.shapes import sag_mm
-from neurolens.pictures.flare.canvas import CELLS, FADE, Floats
+from neurolens.pictures.flare.canvas import CELLS, FADE
 from neurolens.pictures.render.colour import SpectralRange, balance
 from neurolens.pictures.render.job import camera_axes
 from neurolens.pictures.render.scene import Scene
@@ -264,7 +264,7 @@ def _value(path: Path, place: str, name: str, given: Any) -> float:
 
 def light_rays(
     lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
-) -> tuple[Floats, float]:
+) -> tuple[FloatArray, float]:
     """Return rays [6, count] of a light in the lens frame, and the area (mm^2) that all N rays together stand for.
 
     Each of N rays carries the irradiance at the lens times area / N. The rays of a light far away are uniform across
@@ -278,7 +278,7 @@ def light_rays(
     """
     if light.shape is None:
         return rays_across(lens, light, disc(first, count, shift, jitter))
-    parts, rays, areas = patches(light, 1e-9, CELLS), list[Floats](), list[float]()
+    parts, rays, areas = patches(light, 1e-9, CELLS), list[FloatArray](), list[float]()
     shares = np.cumsum([sum(part.light.rgb) for part in parts])
     ends = np.rint(shares * (count / max(float(shares[-1]), 1e-300))).astype(int).tolist()
     for part, begin, end in zip(parts, [0, *ends], ends, strict=False):
@@ -306,7 +306,7 @@ def sides_across(ahead: Array) -> Array:
     return np.array([[1 - x * x / (1 - z), -x * y / (1 - z), x], [x * y / (1 - z), y * y / (1 - z) - 1, -y]])
 
 
-def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[Floats, float]:
+def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[FloatArray, float]:
     """Return rays [6, N] of a light through points [2, N] of the unit disc, and the area in mm^2 of the whole disc.
 
     The disc stands across the light's direction. Equal shares of it carry equal light; see `light_rays`. Points may

@@ -26,12 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.compiler import c_source
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.shapes import sag_mm
-from neurolens.pictures.flare.steps import FILM, LOST, STATE, Floats, Place, Stack, entering, reflects
+from neurolens.pictures.flare.steps import FILM, LOST, STATE, Place, Stack, entering, reflects
 from neurolens.pictures.render.settings import Scatter
 
 BLOCK = 4096  # photons at a time: their states, 40 bytes at every surface, stay in the caches
@@ -60,8 +61,8 @@ class Photons(NamedTuple):
             surface is. cut: photons that would have had more reflections than allowed.
     """
 
-    film_xy_mm: Floats
-    weight: Floats
+    film_xy_mm: FloatArray
+    weight: FloatArray
     reflections: NDArray[np.int32]
     scattered: NDArray[np.int32]
     cast: int
@@ -122,7 +123,7 @@ class PhotonTracer:
 
     def trace(
         self,
-        rays: Floats,
+        rays: FloatArray,
         wavelength_nm: float,
         *,
         most_reflections: int = 10,

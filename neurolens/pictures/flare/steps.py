@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.pose import UPRIGHT, FilmPose
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import c_source, load_compiled
@@ -35,7 +36,7 @@ from neurolens.optics.trace.shapes import Centred, Curve, traced_curve
 from neurolens.optics.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
 from neurolens.optics.trace.tracegraph import transmitted
 from neurolens.optics.trace.transmission import path_mm
-from neurolens.pictures.flare.canvas import LOST, Floats
+from neurolens.pictures.flare.canvas import LOST
 
 Action = Literal["T", "R"]
 STATE = 8  # rows of a ray: x, y, z (mm, this step's frame), direction, power, `worst` (largest r^2 / R^2 at a rim)
@@ -52,7 +53,7 @@ Place = tuple[int, int]  # surface and action
 _UNIT = Medium(1.0, 1.0, 1.0)  # not air, for behind it there may be total reflection
 _FAINT = 2e-4  # ghosts of a smaller reflectance are not seen
 _ASLANT = 0.0, 0.1, 0.2, 0.3  # 1 - cosine of angles at which light meets surfaces
-_MASKS: dict[str, Floats] = {}  # masks of stops, which compiled code points to as long as it is loaded
+_MASKS: dict[str, FloatArray] = {}  # masks of stops, which compiled code points to as long as it is loaded
 
 
 class Shape(NamedTuple):
@@ -148,7 +149,7 @@ def film_graph() -> Graph:
     return g
 
 
-def film_numbers(shift_mm: float, pose: FilmPose) -> Floats:
+def film_numbers(shift_mm: float, pose: FilmPose) -> FloatArray:
     """Return the `FILM` numbers of a film, in the mirrored frame of light towards it.
 
     They are its distance from the last surface along the axis, the directions of its x and y, its normal that points to
@@ -304,7 +305,7 @@ class Stack:
         )
 
     @lru_cache(maxsize=256)  # noqa: B019  a few stacks are kept, which are small
-    def numbers(self, wavelength_nm: float) -> tuple[Floats, Floats]:
+    def numbers(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
         """Return the numbers of all steps [surfaces, actions, width], and those of the film."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
         n = [float(glass.index_of(medium, wavelength_nm)) for medium in lens.media]
@@ -343,7 +344,7 @@ class Stack:
         return np.where(coated, np.mean(aslant, axis=0), ((n1 - n2) / (n1 + n2)) ** 2)
 
 
-def entering(rays: NDArray[np.floating]) -> Floats:
+def entering(rays: NDArray[np.floating]) -> FloatArray:
     """Return states [STATE, N] before the first surface of rays [6, N]: moved near the front vertex, and mirrored."""
     rays = np.asarray(rays, np.float64)
     if rays.ndim != 2 or rays.shape[0] != 6:

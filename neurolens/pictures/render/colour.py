@@ -41,8 +41,8 @@ from neurolens.pictures.render.scenetables import Vector
 Matrix = NDArray[np.float64]
 
 BRADFORD: Matrix = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-FloatArray64 = NDArray[np.float64]
-Spectrum = tuple[FloatArray64, FloatArray64]  # wavelengths in nm, increasing, and values there
+Array = NDArray[np.float64]
+Spectrum = tuple[Array, Array]  # wavelengths in nm, increasing, and values there
 CIE_NAMES = ("D65", "D50", "A", "E")
 _KELVIN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?) ?K")
 COLDEST_K, HOTTEST_K = 500.0, 1e5
@@ -160,7 +160,7 @@ def _csv(name: str) -> list[list[str]]:
 
 
 @cache
-def _tables() -> dict[str, FloatArray64]:
+def _tables() -> dict[str, Array]:
     """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/data/make_spectral_tables.py."""
     names, *rows = _csv("spectra")
     columns = np.array(rows, np.float64).T
@@ -168,19 +168,19 @@ def _tables() -> dict[str, FloatArray64]:
     return dict(zip(names, columns, strict=True))
 
 
-def table(name: str) -> FloatArray64:
+def table(name: str) -> Array:
     """Return a column of the shipped table, one value every 5 nm from 380 to 780 nm."""
     return _tables()[name]
 
 
 @cache
-def daylight_table() -> tuple[FloatArray64, FloatArray64]:
+def daylight_table() -> tuple[Array, Array]:
     """Wavelengths [41] in nm, and the CIE's components S0, S1, S2 of daylight [3, 41] there (CIE 15:2018)."""
     rows = np.array(_csv("daylight")[1:], np.float64).T
     return rows[0], rows[1:]
 
 
-def daylight_weights(x: FloatArray64, y: FloatArray64) -> FloatArray64:
+def daylight_weights(x: Array, y: Array) -> Array:
     """Weights 1, M1, M2 [3, N] of S0, S1, S2 of daylight of chromaticities (x, y) (Wyszecki and Stiles 1982)."""
     below = 0.0241 + 0.2562 * x - 0.7341 * y
     m1 = (-1.3515 - 1.7703 * x + 5.9114 * y) / below
@@ -237,11 +237,11 @@ def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None
     return check_spectrum(path, "row", rows, most)
 
 
-def planck(wavelength_nm: ArrayLike, kelvin: float) -> FloatArray64:
+def planck(wavelength_nm: ArrayLike, kelvin: float) -> Array:
     """Return the spectral radiance of a black body by Planck's law, 1 at 560 nm."""
     nm = np.asarray(wavelength_nm, np.float64)
 
-    def exponent(length_nm: ArrayLike) -> FloatArray64:
+    def exponent(length_nm: ArrayLike) -> Array:
         return _SECOND_RADIATION_CONSTANT / (np.asarray(length_nm) * 1e-9 * kelvin)
 
     # expm1(b) / expm1(a) without overflow where a black body is cold.
@@ -314,7 +314,7 @@ class SpectralRange:
         tables = ("edges_nm", "basis", "response")
         return self.lanes == other.lanes and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in tables)
 
-    def _set_edges(self, edges: FloatArray64) -> None:
+    def _set_edges(self, edges: Array) -> None:
         self.edges_nm, self.centres_nm = edges, 0.5 * (edges[1:] + edges[:-1])
         self._edges, self._widths = (self.rotated(t.astype(np.float32)) for t in (edges[:-1], np.diff(edges)))
         nm = table("wavelength_nm")
@@ -328,7 +328,7 @@ class SpectralRange:
         response = np.linalg.solve(mixing, observer) if self.colours else np.ones((3, self.bins)) * share
         self.response = response.astype(np.float32)
 
-    def _quantiles(self, light_nm: FloatArray64, light: FloatArray64) -> FloatArray64:
+    def _quantiles(self, light_nm: Array, light: Array) -> Array:
         """Return edges [bins + 1] between which wavelengths are equally probable."""
         nm = np.linspace(self.low_nm, self.high_nm, _STEPS + 1)
         seen = np.sqrt(np.sum(self.response.astype(np.float64) ** 2, axis=0))
@@ -341,7 +341,7 @@ class SpectralRange:
         edges[[0, -1]] = self.low_nm, self.high_nm
         return edges
 
-    def means(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
+    def means(self, nm: ArrayLike, values: ArrayLike) -> Array:
         """Return the mean [bins] over each bin of a spectrum given at wavelengths and linear in between."""
         nm, values = np.asarray(nm, np.float64), np.asarray(values, np.float64)
         if self.low_nm == self.high_nm:
@@ -374,11 +374,11 @@ class SpectralRange:
         step = self.bins // self.lanes
         return np.stack([np.roll(table, -lane * step, axis=-1) for lane in range(self.lanes)])
 
-    def film_rgb(self, spectrum: ArrayLike) -> FloatArray64:
+    def film_rgb(self, spectrum: ArrayLike) -> Array:
         """Return the linear sRGB film value [3] of a radiance [bins] relative to D65."""
         return np.asarray(self.response @ np.asarray(spectrum, np.float64) / self.bins)
 
-    def relative(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
+    def relative(self, nm: ArrayLike, values: ArrayLike) -> Array:
         """Scale a light of any unit to the luminance of D65 on the film, as radiance [bins] relative to D65.
 
         It is 0 everywhere where the light has nothing within the range.
@@ -387,7 +387,7 @@ class SpectralRange:
         luminance = self.luminance(ratio)
         return ratio / luminance if luminance > 0 else np.zeros(self.bins)
 
-    def over_d65(self, nm: ArrayLike, values: ArrayLike) -> FloatArray64:
+    def over_d65(self, nm: ArrayLike, values: ArrayLike) -> Array:
         """Divide a spectrum by that of D65; returns [bins]."""
         return self.means(nm, values) / self.means(table("wavelength_nm"), table("d65"))
 

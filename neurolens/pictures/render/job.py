@@ -22,7 +22,7 @@ from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.render import film as columns
 from neurolens.pictures.render.colour import (
     SRGB,
-    FloatArray64,
+    Array,
     Index,
     SpectralRange,
     Spectrum,
@@ -373,7 +373,7 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
 def expected_light(scene: Scene) -> Spectrum:
     """Estimate the spectrum (nm, radiance relative to D65) of a scene's light; surroundings count as all lamps."""
     fine = SpectralRange(*scene.settings.camera.wavelength_nm, _FINE)
-    lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
+    lamps: dict[str, Array] = {}  # sums of emission by illuminant
     for name, emission, area in _lamps(scene):
         lamps[name] = lamps.get(name, 0.0) + area * np.array(emission)
     around = scene.settings.environment

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import FloatArray
 from neurolens.pictures.render import scenetables as tables
 from neurolens.pictures.render.colour import (
-    FloatArray64,
+    Array,
     Index,
     Palette,
     daylight_table,
@@ -330,7 +330,7 @@ class PointLights(LightGroup):
         return direction, distance, self._falloff(number, -direction) / distance2
 
 
-def sun_direction(sky: Sky) -> FloatArray64:
+def sun_direction(sky: Sky) -> Array:
     """Return the unit vector [3] towards the sun's middle."""
     up, around = math.radians(sky.sun_elevation_deg), math.radians(sky.sun_azimuth_deg)
     return np.array([math.cos(up) * math.sin(around), math.sin(up), -math.cos(up) * math.cos(around)])
@@ -347,7 +347,7 @@ def zenith(sky: Sky) -> dict[str, float]:
     return found
 
 
-def sky_colour(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, FloatArray64, FloatArray64]:
+def sky_colour(sky: Sky, direction: FloatArray) -> tuple[Array, Array, Array]:
     """Return luminance [N] (kcd/m^2) and x, y [N] in unit directions [3, N]; below the horizon it is black."""
     height = np.maximum(direction[1].astype(np.float64), 1e-4)
     towards = np.clip(sun_direction(sky) @ direction.astype(np.float64), -1, 1)
@@ -363,7 +363,7 @@ def sky_colour(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, FloatArra
     return np.where(direction[1] >= 0, luminance, 0.0), x, y
 
 
-def sun_spectrum(sky: Sky) -> tuple[FloatArray64, FloatArray64, float]:
+def sun_spectrum(sky: Sky) -> tuple[Array, Array, float]:
     """Return wavelengths (nm), the sun's relative radiance there, and the luminance of its disc (kcd/m^2)."""
     nm = table("wavelength_nm")
     outside = planck(nm, _SUN_K)
@@ -376,7 +376,7 @@ def sun_spectrum(sky: Sky) -> tuple[FloatArray64, FloatArray64, float]:
     return nm, inside, left * _SUN_LUX / solid * 1e-3
 
 
-def total_spectrum(sky: Sky, direction: FloatArray) -> tuple[FloatArray64, NDArray[np.float64]]:
+def total_spectrum(sky: Sky, direction: FloatArray) -> tuple[Array, NDArray[np.float64]]:
     """Return wavelengths (nm) and the spectrum of the sky's light, the mean over directions [3, N]."""
     luminance, x, y = sky_colour(sky, direction)
     nm, components = daylight_table()

@@ -17,7 +17,7 @@ from neurolens.base.errors import NeurolensError
 from neurolens.cameras.contract import FloatArray
 
 IntArray = NDArray[np.int32]
-FloatArray64 = NDArray[np.float64]
+Array = NDArray[np.float64]
 _TINY = np.float32(1e-20)
 NEAREST = np.float32(1e-6)  # a nearer hit, in metres, is on the surface that a ray leaves
 
@@ -55,7 +55,7 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def _parts(vector: FloatArray64) -> list[tuple[int, np.float32]]:
+def _parts(vector: Array) -> list[tuple[int, np.float32]]:
     """Return the components that are not 0, with their axes: most walls have one."""
     return [(k, np.float32(v)) for k, v in enumerate(vector) if v]
 
@@ -79,7 +79,7 @@ def _keep(ok: NDArray[np.bool_], distance: FloatArray, surface: int, best: Float
 class Plane:
     """An infinite plane through `point` with unit `normal`."""
 
-    def __init__(self, first: int, point: FloatArray64, normal: FloatArray64) -> None:
+    def __init__(self, first: int, point: Array, normal: Array) -> None:
         self.first = first
         self._normal, self._offset = _parts(normal), np.float32(point @ normal)
         self._edges: list[tuple[list[tuple[int, np.float32]], np.float32]] = []
@@ -104,7 +104,7 @@ class Plane:
 class Quad(Plane):
     """A rectangle of any orientation: `corner` and two perpendicular edges."""
 
-    def __init__(self, first: int, corner: FloatArray64, edge_u: FloatArray64, edge_v: FloatArray64) -> None:
+    def __init__(self, first: int, corner: Array, edge_u: Array, edge_v: Array) -> None:
         normal = np.cross(edge_u, edge_v)
         super().__init__(first, corner, normal / np.linalg.norm(normal))
         self._offset = np.float32(corner @ normal / np.linalg.norm(normal))  # rounded once less than the plane's
@@ -114,7 +114,7 @@ class Quad(Plane):
 class AxisQuad:
     """A rectangle perpendicular to an axis: the common case, at half the cost of `Quad`."""
 
-    def __init__(self, first: int, corner: FloatArray64, far_corner: FloatArray64, axis: int) -> None:
+    def __init__(self, first: int, corner: Array, far_corner: Array, axis: int) -> None:
         self.first = first
         self._axis = axis
         self._others = [k for k in range(3) if k != axis]
@@ -138,7 +138,7 @@ class AxisQuad:
 class Disc:
     """A flat disc about `centre` with unit `normal`."""
 
-    def __init__(self, first: int, centre: FloatArray64, normal: FloatArray64, radius: float) -> None:
+    def __init__(self, first: int, centre: Array, normal: Array, radius: float) -> None:
         self.first = first
         self._centre, self._normal = centre.astype(np.float32)[:, None], normal.astype(np.float32)
         self._radius2 = np.float32(radius**2)
@@ -163,7 +163,7 @@ class Box:
     a wall of the room that it photographs.
     """
 
-    def __init__(self, first: int, low: FloatArray64, high: FloatArray64, room: bool) -> None:
+    def __init__(self, first: int, low: Array, high: Array, room: bool) -> None:
         self.first = first
         self.room = room
         self.low, self.high = low.astype(np.float32), high.astype(np.float32)
@@ -224,9 +224,7 @@ class Spheres:
         rows: [S] numbers of these spheres among all, where they are only some.
     """
 
-    def __init__(
-        self, first: int, centres: FloatArray64, radii: FloatArray64, rows: NDArray[np.intp] | None = None
-    ) -> None:
+    def __init__(self, first: int, centres: Array, radii: Array, rows: NDArray[np.intp] | None = None) -> None:
         self.first = first
         self._surfaces = first + (np.arange(len(radii)) if rows is None else rows)
         self._kind: type[np.floating[Any]] = np.float64 if radii.max() > _LARGE_M else np.float32
@@ -289,7 +287,7 @@ class SphereClusters:
     Arguments are those of `Spheres`.
     """
 
-    def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
+    def __init__(self, first: int, centres: Array, radii: Array) -> None:
         self.first = first
         low, high = centres - radii[:, None], centres + radii[:, None]
         # Boxes are slightly wider, so that rounding to float32 cuts off no sphere that rays near the scene meet.
@@ -314,7 +312,7 @@ class SphereClusters:
                 best[near], found[near] = nearest, surface
 
 
-def _clusters(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.intp]]:
+def _clusters(rows: NDArray[np.intp], centres: Array) -> list[NDArray[np.intp]]:
     """Group rows of neighbours: they are halved at the median of their longest side until they are few enough."""
     if len(rows) <= MANY_SPHERES:
         return [rows]
@@ -330,7 +328,7 @@ class Mesh:
         NeurolensError: Embree is not installed.
     """
 
-    def __init__(self, first: int, triangles: FloatArray64, each: int = 1) -> None:
+    def __init__(self, first: int, triangles: Array, each: int = 1) -> None:
         try:
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
@@ -344,7 +342,7 @@ class Mesh:
         self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
 
     @classmethod
-    def of_rectangles(cls, first: int, corners: FloatArray64) -> Mesh:
+    def of_rectangles(cls, first: int, corners: Array) -> Mesh:
         """Make a mesh of rectangles [T, 3 corners, 3], two triangles each; corner 0 lies between the other two."""
         far = corners[:, 1] + corners[:, 2] - corners[:, 0]
         others = np.stack([far, corners[:, 2], corners[:, 1]], axis=1)
@@ -373,7 +371,7 @@ class Mesh:
             start = start.take(again, axis=1) + direction.take(again, axis=1) * _STEP
 
 
-def triangle_planes(corners: FloatArray64) -> FloatArray64:
+def triangle_planes(corners: Array) -> Array:
     """Return plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
 
     Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
