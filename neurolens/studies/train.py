@@ -112,19 +112,8 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress, rend
     with progress.stage("trace ray pairs") as report:
         pairs = make_pairs(lens, domain, experiment.pairs, report)
         prepared = prepare(pairs)
-    count, target = experiment.evaluation.vignetting_rays, experiment.target
-    within_um = target.within_um(domain.film_radius_mm) if target else None
-    fresh = cache(lambda: shared_rays(prepared, count))
-    measured = list[Measured]()
-    for model in experiment.model:
-        with progress.stage(f"fit {model.label}") as report:
-            measured.append(fit_and_measure(prepared, model, models, count, report, fresh))
-        poor = what_is_poor(measured[-1].record)
-        if poor and model.family != "paraxial":
-            text = f"{model.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
-            warnings.warn(text, NeurolensWarning, stacklevel=2)
-        if within_um and reaches(measured[-1].record, within_um):
-            break
+    within_um = experiment.target.within_um(domain.film_radius_mm) if experiment.target else None
+    measured = _fitted(experiment, prepared, models, within_um, progress)
     records = [m.record for m in measured]
     timed = _race(experiment, prepared, measured, progress)
     use = to_use(records, within_um or CLOSE_UM, exact=exact_of(exact_records(timed)))
@@ -143,20 +132,7 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress, rend
     data, facts = first_order(lens), {key: getattr(lens, key) for key in keys}
     return {
         "lens": {**facts, "file": Path(lens.path).name, "efl_mm": data.efl_mm, "f_number": data.f_number},
-        "domain": {
-            "film_radius_mm": domain.film_radius_mm,
-            "f_number": data.f_number,
-            "wavelength_nm": list(domain.wavelength_nm),
-            "focus_m": ["infinity" if f == math.inf else f for f in domain.focus_m],
-            "nearest_m": domain.nearest_m,
-            "pupil_plane_z_mm": domain.pupil_z_mm,
-            "pupil_radius_mm": domain.pupil_radius_mm,
-            "passing_share": len(pairs.train) / pairs.tested,
-            "rays_train": len(pairs.train),
-            "rays_held_out": MORE * len(pairs.held_out),
-            "rays_rim": len(pairs.rim),
-            "pixel_um": pixel_um(domain),
-        },
+        "domain": _domain_table(pairs, data.f_number),
         "settings": settings,
         "models": records,
         "target": target_record(records, within_um) if within_um else None,
@@ -165,6 +141,43 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress, rend
         "images": drawn.images,
         "image_settings": drawn.settings,
         "figures": _draw(pairs, records, timed, light, pictures, use) + drawn.figures,
+    }
+
+
+def _fitted(
+    experiment: Experiment, prepared: Prepared, folder: Path, within_um: float | None, progress: Progress
+) -> list[Measured]:
+    """Fit the models of an experiment in their order, up to the first whose error is at most `within_um`."""
+    count = experiment.evaluation.vignetting_rays
+    fresh, measured = cache(lambda: shared_rays(prepared, count)), list[Measured]()
+    for model in experiment.model:
+        with progress.stage(f"fit {model.label}") as report:
+            measured.append(fit_and_measure(prepared, model, folder, count, report, fresh))
+        poor = what_is_poor(measured[-1].record)
+        if poor and model.family != "paraxial":
+            text = f"{model.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
+            warnings.warn(text, NeurolensWarning, stacklevel=2)
+        if within_um and reaches(measured[-1].record, within_um):
+            break
+    return measured
+
+
+def _domain_table(pairs: RayPairs, f_number: float) -> dict[str, Any]:
+    """Return the domain of a run as a table, with how many rays each split has."""
+    domain = pairs.domain
+    return {
+        "film_radius_mm": domain.film_radius_mm,
+        "f_number": f_number,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["infinity" if f == math.inf else f for f in domain.focus_m],
+        "nearest_m": domain.nearest_m,
+        "pupil_plane_z_mm": domain.pupil_z_mm,
+        "pupil_radius_mm": domain.pupil_radius_mm,
+        "passing_share": len(pairs.train) / pairs.tested,
+        "rays_train": len(pairs.train),
+        "rays_held_out": MORE * len(pairs.held_out),
+        "rays_rim": len(pairs.rim),
+        "pixel_um": pixel_um(domain),
     }
 
 

@@ -489,6 +489,12 @@ def shape_of(block: Block) -> ShapeFields:
             if any((x, y, a, b, c)):
                 block.turn = Turn(Placement((x, y, 0.0), (a, b, c)), tilts_first=bool(block.parameter(6)))
             block.parameters.pop(6, None)
+    _refuse_rest(block)
+    return shape
+
+
+def _refuse_rest(block: Block) -> None:
+    """Refuse what a surface still states after its shape was read."""
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
         for n, (value, line) in table.items():
             # The second extra value of a toroid is a normalisation radius, for no terms.
@@ -497,7 +503,6 @@ def shape_of(block: Block) -> ShapeFields:
     for word, given in (("CURV", block.bends), ("GLAS", block.glass)):
         if block.kind == "COORDBRK" and given is not None:
             raise given.error(f"{word} of COORDBRK", given.text.strip(), "none: a coordinate break is no surface")
-    return shape
 
 
 def _q_type(block: Block) -> ShapeFields:
