@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays
-from neurolens.optics.trace.rays import passing
+from neurolens.optics.trace.arrays import passing
 from neurolens.optics.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
@@ -137,7 +137,8 @@ class FilmLight:
         return camera_rays(x, y, self.film_z_mm, u.reshape(-1), v.reshape(-1), self.plane_z_mm)
 
     def _passes(self, u: Tensor, v: Tensor) -> Tensor:
-        return passing(self.lens, self._rays(u, v), self.lens.reference_nm).reshape(u.shape)
+        rays = Rays(*(c.numpy() for c in self._rays(u, v)))
+        return torch.from_numpy(passing(self.lens, rays, self.lens.reference_nm)).reshape(u.shape)
 
     def sums(self, level: int) -> Array:
         """Return the integrals [F] of cos^4 over what is lit."""

@@ -3,7 +3,7 @@
 Surfaces and their tests are those of the tracer (`surfaces`); only `rays` follows derivatives, power and paths.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,17 @@ from neurolens.base import status as st
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.trace.arithmetic import NUMPY
 from neurolens.optics.trace.shapes import traced_curve
-from neurolens.optics.trace.surfaces import UNIT_SLACK, Hit, Rays, Test, cross, media, nearest_approach, rim_tests
+from neurolens.optics.trace.surfaces import (
+    UNIT_SLACK,
+    Hit,
+    Rays,
+    Test,
+    Towards,
+    cross,
+    media,
+    nearest_approach,
+    rim_tests,
+)
 
 Array = NDArray[np.float64]
 
@@ -36,22 +46,14 @@ class Followed(NamedTuple):
     at_stop: tuple[Array, Array]
 
 
-def follow(lens: Lens, rays: Rays, wavelength_nm: Any, towards: Literal["scene", "film"] = "scene") -> Followed:
-    """Follow rays [N] of one wavelength, or of [N], through the whole lens, as `rays.trace` does."""
-    return _follow(lens, rays, wavelength_nm, towards == "film")
-
-
-def passing(lens: Lens, rays: Rays, wavelength_nm: float) -> NDArray[np.bool_]:
-    """Test whether camera rays pass the whole lens, bool [N]; lost rays take no more work at later surfaces."""
-    passed = np.zeros(len(rays.x), bool)
-    for first in range(0, len(rays.x), _CHUNK):
-        part = Rays(*(c[first : first + _CHUNK] for c in rays))
-        passed[first : first + _CHUNK] = _follow(lens, part, wavelength_nm, False, prune=True).status == st.PASSED
-    return passed
-
-
 @np.errstate(all="ignore")  # lost rays overflow and give NaN
-def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bool = False) -> Followed:
+def follow(lens: Lens, rays: Rays, wavelength_nm: Any, towards: Towards = "scene", *, prune: bool = False) -> Followed:
+    """Follow rays [N] of one wavelength, or of [N], through the whole lens, as `rays.trace` does.
+
+    With `prune` lost rays take no more work at later surfaces, which pays where most rays are lost, and only the status
+    has a meaning.
+    """
+    to_film = towards == "film"
     sense, order = (1, range(len(lens.surfaces))) if to_film else (-1, range(len(lens.surfaces))[::-1])
     mediums, vertex, left = media(lens, wavelength_nm), 0.0, np.arange(len(rays.x))
     vertices = [float(z) for z in lens.vertices_mm]
@@ -83,3 +85,10 @@ def _follow(lens: Lens, rays: Rays, wavelength_nm: Any, to_film: bool, prune: bo
             alive = here == st.PASSED
             left, r = left[alive], Rays(*(c[alive] for c in r))
     return Followed(Rays(*r[:2], r.z + vertex, *(d / mediums[-1 if to_film else 0].n for d in r[3:])), status, at_stop)
+
+
+def passing(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards = "scene") -> NDArray[np.bool_]:
+    """Test whether rays pass the whole lens, bool [N]: where the status of `rays.trace` is 0."""
+    parts = [Rays(*(c[k : k + _CHUNK] for c in rays)) for k in range(0, len(rays.x), _CHUNK)]
+    each = [follow(lens, part, wavelength_nm, towards, prune=True).status == st.PASSED for part in parts]
+    return np.concatenate([np.zeros(0, bool), *each])

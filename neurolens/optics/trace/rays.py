@@ -28,6 +28,7 @@ from neurolens.optics.trace.surfaces import (
     Rays,
     SurfaceStep,
     Test,
+    Towards,
     cross,
     media,
     nearest_approach,
@@ -36,12 +37,8 @@ from neurolens.optics.trace.surfaces import (
 )
 from neurolens.optics.trace.tensors import Survival, Tensors, at_most
 
-Towards = Literal["scene", "film"]
-
 # Rays per chunk: enough to hide the cost of calling an operator, few enough for a core's second-level cache.
 CHUNK = 32768
-# Once fewer than this share of the rays is left, `passing` packs them together.
-_FEWER = 0.8
 
 
 class Crossing(NamedTuple):
@@ -157,33 +154,6 @@ def _joined(parts: Sequence[Any]) -> Any:
     return first
 
 
-def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
-    """Test whether rays pass the whole lens, bool [N]: exactly where the status of `trace` is 0.
-
-    Lost rays take no more work at later surfaces, which pays where most rays are lost. Arguments and errors are those
-    of `trace`, with one wavelength.
-    """
-    check_rays(lens, rays, wavelength_nm)
-    keep_memory()
-    chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
-    with torch.no_grad():
-        return torch.cat([_passing_chunk(lens, Rays(*chunk), wavelength_nm, towards) for chunk in chunks])
-
-
-def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards) -> Tensor:
-    sense, order = _path(lens, towards)
-    tracing, left = Tracing(lens, rays, wavelength_nm, sense, order[0], False), torch.arange(len(rays.x))
-    for k in order:
-        tracing.cross(k)
-        if float(tracing.tests.passed.sum()) < _FEWER * len(left):
-            alive = torch.nonzero(tracing.tests.passed)[:, 0]
-            tracing.rays, left = Rays(*(c.index_select(0, alive) for c in tracing.rays)), left.index_select(0, alive)
-            tracing.tests = Survival(torch.ones_like(tracing.rays.x), st.PASSED)
-    passed = torch.zeros(len(rays.x), dtype=torch.bool)
-    passed[left] = tracing.tests.passed > 0
-    return passed
-
-
 def _differentiated(value: Any) -> bool:
     """Test whether derivatives with respect to a value are followed, backwards or forwards."""
     if not isinstance(value, Tensor):
@@ -198,12 +168,6 @@ def _parameters(lens: Lens) -> list[Any]:
         found += (a for _, a in s.figure.powers)
         found += (figure for layer in (s.coating.layers if s.coating else ()) for figure in layer)
     return found
-
-
-def _path(lens: Lens, towards: Towards) -> tuple[int, range]:
-    """Return the sense of travel along z, and the surfaces in the order in which light meets them."""
-    last = len(lens.surfaces) - 1
-    return (1, range(last + 1)) if towards == "film" else (-1, range(last, -1, -1))
 
 
 class Tracing:
@@ -305,7 +269,7 @@ def _trace_chunk(
     path: bool,
     freeze: bool,
 ) -> Traced:
-    sense, order = _path(lens, towards)
+    sense, order = (1, range(len(lens.surfaces))) if towards == "film" else (-1, range(len(lens.surfaces))[::-1])
     tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], path or bool(record), freeze)
     power = TensorPassage(tracing.o, lens, tracing.wavelength_nm) if transmittance else None
     crossings: dict[int, Crossing] = {}

@@ -14,7 +14,7 @@ started from the quadric that fits best; started at the vertex plane it fails be
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,9 @@ Array = NDArray[np.float64]
 
 # A test (low, high) is passed where low is at most high; NaN passes none.
 Test = tuple[Any, Any]
+
+
+Towards = Literal["scene", "film"]  # where rays travel: camera rays to the scene, light to the film
 
 
 class Rays(NamedTuple):

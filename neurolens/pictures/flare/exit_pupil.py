@@ -14,7 +14,8 @@ from neurolens.optics.analysis.exit_pupil import Array, ExitPupil, arrived, fitt
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.setting.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.trace.aiming import without_rims
-from neurolens.optics.trace.rays import Rays, passing, trace
+from neurolens.optics.trace.arrays import passing
+from neurolens.optics.trace.rays import Rays, trace
 from neurolens.pictures.flare.lights import Light, Patch, disc, light_towards, rays_across
 
 CELLS = 1024  # cells across the pupil
@@ -102,7 +103,7 @@ def _box(lens: Lens, light: Light, wavelength_nm: float) -> Array | None:
     places: Array = disc(0, _SEARCH)
     for step in (0.02, 0.05, 0.05):
         rays, _ = rays_across(lens, light, places)
-        passed = passing(lens, Rays(*torch.from_numpy(rays)), wavelength_nm, towards="film").numpy()
+        passed = passing(lens, Rays(*rays.astype(np.float64)), wavelength_nm, "film")
         if not passed.any():
             return None
         box = np.stack([places[:, passed].min(1), places[:, passed].max(1)])

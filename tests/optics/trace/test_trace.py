@@ -17,7 +17,8 @@ from neurolens.base import status as st
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.prescription import Lens, Surface
 from neurolens.optics.setting.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.optics.trace.rays import CHUNK, Rays, Towards, passing, trace
+from neurolens.optics.trace.arrays import passing
+from neurolens.optics.trace.rays import CHUNK, Rays, Towards, trace
 
 INF = math.inf
 WIDE = 1000.0
@@ -227,7 +228,7 @@ def test_recording_changes_no_status() -> None:
 @pytest.mark.parametrize("towards", ["scene", "film"])
 @pytest.mark.parametrize("name", ["muller_fisheye_100", "canon_aspheric_50", "schneider_anamorphic_31"])
 def test_passing_is_status_0_without_the_lost_rays(name: str, towards: Towards) -> None:
-    """Bit for bit, over several chunks, of which most rays are lost; NaN and no ray at all, too."""
+    """Over several chunks, of which most rays are lost; NaN and no ray at all, too."""
     table = focused(name)
     start = bundle(table, 2 * CHUNK + 5, film=1.5)
     if towards == "film":
@@ -235,12 +236,11 @@ def test_passing_is_status_0_without_the_lost_rays(name: str, towards: Towards) 
         start = Rays(*(torch.where(torch.rand(c.shape) < 0.5, c, c.flip(0)) for c in out.rays))
         start = Rays(*start[:3], *(-c for c in start[3:]))
     start.x[7] = math.nan
-    for dtype in (torch.float32, torch.float64):
-        rays = Rays(*(c.to(dtype) for c in start))
-        found = passing(table, rays, 500.0, towards=towards)
-        assert torch.equal(found, trace(table, rays, 500.0, towards=towards).status == 0)
-        assert 0 < found.sum() < 0.8 * len(found)
-    assert passing(table, Rays(*(c[:0] for c in start)), 500.0).shape == (0,)
+    start = Rays(*(c.to(torch.float64) for c in start))
+    found = passing(table, Rays(*(c.numpy() for c in start)), 500.0, towards)
+    assert torch.equal(torch.from_numpy(found), trace(table, start, 500.0, towards=towards).status == 0)
+    assert 0 < found.sum() < 0.8 * len(found)
+    assert passing(table, Rays(*(c[:0].numpy() for c in start)), 500.0).shape == (0,)
 
 
 @pytest.mark.slow
