@@ -225,9 +225,9 @@ def rays(
     width, height = (
         None if pixels is None else _whole(name, pixels, 1) for name, pixels in (("width", width), ("height", height))
     )
+    if film is None:
+        film, _ = film_of(os.fspath(camera), **Shot.part(**settings).size)
     try:
-        if film is None:
-            film, _ = film_of(os.fspath(camera), **Shot.part(**settings).size)
         film = check_film(film)
     except (TypeError, InputError):
         raise InputError("rays", "film", film, f"a width and a height, each {said(FILM_MM)} mm") from None

@@ -333,6 +333,7 @@ def test_mistakes_are_one_line_and_leave_nothing(capsys: pytest.CaptureFixture[s
         ({"seed": -1}, "seed: got -1, expected an integer from 0"),
         ({"film": (36, 0)}, "film: .* a width and a height"),
         ({"film": 36}, "film: got 36, expected a width and a height"),
+        ({"camera": "no_such_lens", "film": None}, r"no_such_lens: camera: got \(missing\)"),
         ({"position_m": (0, 0)}, "position_m: .* three numbers"),
         ({"up": (0, math.nan, 0)}, "up: .* three numbers"),
         ({"wavelengths": []}, "wavelengths: .* one or more in nm"),
