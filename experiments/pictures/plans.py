@@ -251,7 +251,8 @@ class WarpedByTables(Warped):
         self._fields: dict[int, Field] = {}
         super().__init__(flat, camera, focus_m)
         wide = copy(flat)
-        wide.film_mm = tuple(map(float, self.sides * self.film_mm))
+        width, height = self.sides * self.film_mm
+        wide.film_mm = float(width), float(height)
         self._fields = {id(camera): field_of(camera, focus_m), id(flat): field_of(wide, focus_m)}
 
     def _place_and_light(self, camera: Camera, point: Any) -> tuple[Any, Any]:
