@@ -90,7 +90,7 @@ class ExitPupil:
     def passes(self, places: Array | tuple[Array, ...]) -> NDArray[np.bool_]:
         """Whether light passes at points [2, N] of the box (-1 to 1); a tuple of two axes stands for their grid."""
         at = self._at(places, slice(2, None))
-        at = at.reshape(-1, 2, *at.shape[1:])
+        at = at.reshape(len(self.limits_mm), 2, *at.shape[1:])
         return _lets(self.aperture, (at.T / self.limits_mm).T)[0]
 
     def open_share(self, cells: int) -> Array:

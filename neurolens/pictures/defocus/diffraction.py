@@ -196,7 +196,7 @@ def _cut(camera: Any, place_mm: Place, kernels: Array) -> Array:
     down, right = np.array([[0, -_STEP_MM], [_STEP_MM, 0]])
     ends = np.array(on_upright(camera, [np.add(place_mm, d) for d in (down, -down, right, -right)]))
     moves = (ends[::2] - ends[1::2])[:, ::-1].T * [[-1], [1]] / (2 * _STEP_MM)  # of row and column by row and column
-    return stretched(kernels, moves)
+    return np.asarray(stretched(kernels, moves), np.float64)
 
 
 def lens_of(camera: Any) -> Lens:
