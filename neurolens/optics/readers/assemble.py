@@ -68,6 +68,9 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
         object_medium=Medium(**draft.object_medium),
         wavelengths_nm=draft.wavelengths_nm,
     )
+    if draft.working and draft.f_number is not None and math.isfinite(draft.object_distance):
+        pupil = working_pupil(lens, draft.f_number, draft.object_distance)
+        draft, lens = replace(draft, f_number=None, pupil=pupil), replace(lens, f_number=math.nan)
     if draft.drawn:
         lens = with_likely_rims(lens, draft)
     if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
@@ -241,6 +244,16 @@ def pupil_of(lens: Lens, object_na: float, distance: float) -> float:
         expected = "an aperture below the index in front, of an object at a finite distance"
         raise InputError(lens.path, "numerical aperture of the object", object_na, expected)
     return 2 * reach * sine / math.sqrt(1 - sine * sine)
+
+
+def working_pupil(lens: Lens, f_number: float, distance: float) -> float:
+    """Return the entrance pupil's diameter at which the image of a near object has this f-number, else InputError."""
+    data = first_order(lens.with_stop_radius(1.0))
+    reach, beyond_focus = distance + data.entrance_pupil_z_mm, distance + data.front_focal_z_mm
+    if not (reach > 0 and beyond_focus):
+        expected = "an object in front of the entrance pupil and out of focus, or the diameter of the pupil"
+        raise InputError(lens.path, "f-number of a near object", f_number, expected)
+    return abs(data.efl_mm * reach / (f_number * beyond_focus))
 
 
 def smaller_stop(file: str, wanted: float, limit: float | None, state: str = "") -> float:

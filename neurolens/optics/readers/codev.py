@@ -404,6 +404,9 @@ def _complete(file: File) -> None:
 
     file.states = file.zoom.states(file.blocks, "position", "ZOO CIR", solve)
     file.object_distance, file.object_medium = first.thickness, first.medium
+    file.working = file.f_number is not None
+    if file.working and math.isfinite(first.thickness):
+        assume(file.file, f"FNO {file.f_number:g} is taken as the f-number at the image of the near object")
     primary = file.waves_nm[file.reference - 1] if 0 < file.reference <= len(file.waves_nm) else 0.0
     file.wavelengths_nm = primary_first(file.waves_nm, primary)
     file.film_given = not (last.solved and last.thickness == defocus)

@@ -217,6 +217,7 @@ class Draft:
         notes: lines of text.
         pupil, f_number, object_na: if one is given, it sizes the stop, else the stop's diameter does. `object_na` is
             the numerical aperture n sin(theta) of the beam from the axis of a near object.
+        working: whether the f-number of a near object is that of its image, not of an object at infinity.
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
         drawn: whether somebody measured rims in a drawing, and gave some as radii in place of diameters. These are
@@ -238,6 +239,7 @@ class Draft:
     pupil: float | None = None
     f_number: float | None = None
     object_na: float | None = None
+    working: bool = False
     image_radius: float | None = None
     half_field_deg: float | None = None
     object_distance: float = math.inf

@@ -99,7 +99,6 @@ class File(Draft):
     zoom: Positions = field(default_factory=Positions)
     makers: list[str] = field(default_factory=list)
     without_film: bool = False
-    working: Line | None = None  # where the f-number is the working one
     field_type: int = 0
     fields: int = 0
     heights: dict[str, list[float]] = field(default_factory=dict)
@@ -181,7 +180,7 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             file.pupil = line.positive(word, rest)
         case "FNUM":
             file.f_number = line.positive(word, rest)
-            file.working = line if rest[1:2] == ["1"] else None
+            file.working = rest[1:2] == ["1"]
         case "OBNA":
             if rest[1:2] == ["1"]:
                 expected = "a numerical aperture, with flag 0: an angle of the object's cone is not read"
@@ -383,8 +382,6 @@ def _complete(file: File) -> None:
         raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
     if image.curvature:
         warn(file.file, "the image surface is curved; the film is taken as plane")
-    if file.f_number is not None and file.working and math.isfinite(first.thickness):
-        raise file.working.error("FNUM", "(the working f-number of a near object)", "ENPD, FLOA, or FNUM with flag 0")
     last = middle[-1]
     file.notes = ["\n".join(file.notes).strip()]
     file.object_distance, file.object_medium = first.thickness, first.medium

@@ -279,6 +279,22 @@ def test_the_numerical_aperture_of_a_near_object_sizes_the_stop(tmp_path: Path) 
     )
 
 
+def test_the_working_f_number_is_that_at_the_image_of_a_near_object(tmp_path: Path) -> None:
+    """The paraxial ray from the axial point to the edge of the stop, the first surface, leaves at a slope of 1/8."""
+    zemax = swapped("DISZ INFINITY", "DISZ 500", swapped("ENPD 10", "FNUM 4 1"))
+    codev = "RDM;LEN\nFNO 4\nYAN 0 5\nSO 0 500\nS 50 5 NBK7_SCHOTT\nSTO\nS -50 45\nCIR 9\nSI 0 0\n"
+    (tmp_path / "lens.seq").write_text(codev)
+    lens, told = heard(tmp_path / "lens.seq")
+    assert "FNO 4 is taken as the f-number at the image of the near object" in told
+    for made in (lens, heard_text(zemax, tmp_path)[0]):
+        n, y = made.surfaces[0].n_d, made.stop_radius_mm
+        slope = (y / 500 - y * (n - 1) / 50) / n
+        y += 5 * slope
+        assert n * slope - y * (n - 1) / 50 == pytest.approx(-1 / 8, rel=1e-12)
+        assert made.f_number == pytest.approx(first_order(made).f_number)
+        assert made.configurations[0].stop_diameter_mm == pytest.approx(2 * made.stop_radius_mm)
+
+
 def test_the_film_of_a_near_object_is_judged_by_its_image(tmp_path: Path) -> None:
     """By Newton's formula: of an object x in front of the front focus, the image lies f^2 / x behind the rear one."""
     data = first_order(heard_text(HEAD + BODY + TAIL, tmp_path)[0])
