@@ -302,6 +302,8 @@ def _glass(file: File, line: Line, rest: list[str]) -> MediumFields:
     if name.upper() == "MIRROR" or not name:
         raise line.error("GLAS", name, "a glass: the lens model has no mirrors")
     if name.upper() in ("AIR", "VACUUM"):
+        if name.upper() == "VACUUM":
+            warn(line.file, f"line {line.number}, GLAS: VACUUM is taken as air, whose index is 0.0003 higher")
         return {}
     if kind == "1" or name == "___BLANK":
         n_d, V_d, departure = (*line.numbers("GLAS", rest[3:6]), 0.0, 0.0)[:3]
@@ -380,7 +382,7 @@ def _complete(file: File) -> None:
     file.rows = placed(rows, file.blocks[1:])
     if image.thickness or image.stop or image.medium not in ({}, middle[-1].medium):
         raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
-    if image.curvature:
+    if image.curvature or any(value for value, _ in image.parameters.values()):
         warn(file.file, "the image surface is curved; the film is taken as plane")
     last = middle[-1]
     file.notes = ["\n".join(file.notes).strip()]

@@ -172,6 +172,8 @@ def test_an_image_under_water_is_no_file_cut_off(tmp_path: Path) -> None:
         ("VDXN 0 0 0", "VDXN 0 0.1 0", "vignetting factors"),
         ('  DIAM 9 1 0 0 1 ""\n', '  DIAM 9 1 0 0 1 ""\n  SQAP 4 5\n', "SQAP"),
         ("SURF 3\n  TYPE STANDARD\n  CURV 0.0", "SURF 3\n  TYPE STANDARD\n  CURV 0.01", "image surface is curved"),
+        ("SURF 3\n  TYPE STANDARD", "SURF 3\n  TYPE EVENASPH\n  PARM 2 1E-5", "image surface is curved"),
+        ("DISZ 45.0", "DISZ 45.0\n  GLAS VACUUM", r"line \d+, GLAS: VACUUM is taken as air"),
     ],
 )
 def test_what_is_left_out_is_told(old: str, new: str, message: str, tmp_path: Path) -> None:
