@@ -69,8 +69,8 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
         wavelengths_nm=draft.wavelengths_nm,
     )
     if draft.working and draft.f_number is not None and math.isfinite(draft.object_distance):
-        pupil = working_pupil(lens, draft.f_number, draft.object_distance)
-        draft, lens = replace(draft, f_number=None, pupil=pupil), replace(lens, f_number=math.nan)
+        draft = replace(draft, f_number=None, pupil=working_pupil(lens, draft.f_number, draft.object_distance))
+        lens = replace(lens, f_number=math.nan)
     if draft.drawn:
         lens = with_likely_rims(lens, draft)
     if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
