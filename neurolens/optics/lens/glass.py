@@ -149,7 +149,6 @@ def _root(square: Any) -> Any:
 MAKERS = ("Schott", "Ohara", "Hoya", "Hikari", "CDGM", "Sumita", "LZOS", "generic")
 
 _BY_LETTERS = {maker.upper(): maker for maker in MAKERS}
-_LEAST_INDEX = 1.3  # of a glass
 _LONGEST = 100  # Only so many characters of a name count.
 
 # Other names of the same dispersion: Schott publishes one set of coefficients for BK7 and N-BK7.
@@ -254,12 +253,11 @@ def figures_of_code(code: str) -> tuple[float, float] | None:
     It is written as 517642, 517.642, 517.64 or 516800.641700. No glass has an index below 1.3: 003283 stands for 2.003
     and 28.3, as 1003300.283000 does with more digits.
     """
-    match = re.fullmatch(r"([0-9]{3,7})\.([0-9]{2,6})|([0-9]{3})([0-9]{3})", code)
-    if not match:
+    if not (match := re.fullmatch(r"([0-9]{3,7})\.([0-9]{2,6})|([0-9]{3})([0-9]{3})", code)):
         return None
     index, abbe = match[1] or match[3], match[2] or match[4]
     n_d = 1 + int(index) / 10 ** min(len(index), 6)
-    return n_d + (n_d < _LEAST_INDEX), int(abbe) / 10 ** (len(abbe) - 2)
+    return n_d + (n_d < 1.3), int(abbe) / 10 ** (len(abbe) - 2)
 
 
 def by_code(code: str, count: int = 3) -> list[Glass]:

@@ -68,17 +68,13 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
         object_medium=Medium(**draft.object_medium),
         wavelengths_nm=draft.wavelengths_nm,
     )
-    if draft.working and draft.f_number is not None and math.isfinite(draft.object_distance):
-        draft = replace(draft, f_number=None, pupil=working_pupil(lens, draft.f_number, draft.object_distance))
-        lens = replace(lens, f_number=math.nan)
     if draft.drawn:
         lens = with_likely_rims(lens, draft)
     if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
-    pupil = draft.pupil if draft.object_na is None else pupil_of(lens, draft.object_na, draft.object_distance)
-    lens = finish(lens, pupil_mm=pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
+    lens = finish(lens, pupil_mm=pupil_of(lens, draft), film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
     if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
         message = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
         warn(draft.file, f"{message}: the diameter is kept")
@@ -236,24 +232,21 @@ def finish(
     return replace(lens, surfaces=tuple(rows), f_number=float(stated))
 
 
-def pupil_of(lens: Lens, object_na: float, distance: float) -> float:
-    """Return the diameter of the entrance pupil at which a near object has this numerical aperture, else InputError."""
-    sine = object_na / float(lens.object_medium.n_d)
-    reach = distance + first_order(lens.with_stop_radius(1.0)).entrance_pupil_z_mm
-    if not (sine < 1 and 0 < reach < math.inf):
-        expected = "an aperture below the index in front, of an object at a finite distance"
-        raise InputError(lens.path, "numerical aperture of the object", object_na, expected)
-    return 2 * reach * sine / math.sqrt(1 - sine * sine)
-
-
-def working_pupil(lens: Lens, f_number: float, distance: float) -> float:
-    """Return the entrance pupil's diameter at which the image of a near object has this f-number, else InputError."""
-    data = first_order(lens.with_stop_radius(1.0))
-    reach, beyond_focus = distance + data.entrance_pupil_z_mm, distance + data.front_focal_z_mm
-    if not (reach > 0 and beyond_focus):
-        expected = "an object in front of the entrance pupil and out of focus, or the diameter of the pupil"
-        raise InputError(lens.path, "f-number of a near object", f_number, expected)
-    return abs(data.efl_mm * reach / (f_number * beyond_focus))
+def pupil_of(lens: Lens, draft: Draft) -> float | None:
+    """Return the diameter of the entrance pupil that a file gives, or a near object's beam; else InputError."""
+    if draft.object_na is None and draft.image_f_number is None:
+        return draft.pupil
+    data, sine = first_order(lens.with_stop_radius(1.0)), (draft.object_na or 0.0) / float(lens.object_medium.n_d)
+    reach, beyond_focus = (draft.object_distance + z for z in (data.entrance_pupil_z_mm, data.front_focal_z_mm))
+    if not (sine < 1 and 0 < reach < math.inf and beyond_focus):
+        raise InputError(
+            lens.path,
+            "numerical aperture of the object",
+            draft.object_na,
+            "an aperture below the index in front, of an object at a finite distance",
+        )
+    by_image = abs(data.efl_mm / beyond_focus) / (draft.image_f_number or math.inf)
+    return reach * (by_image or 2 * sine / math.sqrt(1 - sine * sine))
 
 
 def smaller_stop(file: str, wanted: float, limit: float | None, state: str = "") -> float:
@@ -278,6 +271,8 @@ def first_order(lens: Lens) -> FirstOrder:
         if not lens.anamorphic:
             raise
         data = paraxial.first_order(lens, meridian="x")
+    if not data.efl_mm:
+        raise InputError(lens.path, "film", "(in the hole of a pinhole)", "a film behind the hole")
     if not 0 < data.entrance_pupil_diameter_mm < math.inf:
         found = f"(seen from the scene {data.entrance_pupil_diameter_mm:g} mm wide)"
         raise InputError(lens.path, "stop", found, "a stop whose image in front of it has a size")

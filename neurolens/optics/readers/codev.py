@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from neurolens.base.errors import InputError
+from neurolens.optics.lens.glass import figures_of_code
 from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens, MediumFields
 from neurolens.optics.readers import draft
@@ -23,7 +24,7 @@ from neurolens.optics.readers.draft import (
     placed,
     primary_first,
 )
-from neurolens.optics.readers.glasses import by_code, by_indices, named_glass
+from neurolens.optics.readers.glasses import by_indices, named_glass
 from neurolens.optics.readers.source import Line, ReadOptions, assume, by_word, read_lines, warn
 
 UNITS = {"M": "mm", "C": "cm", "I": "in"}
@@ -62,7 +63,6 @@ READ = (
     *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM DAR REV".split(),
     *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0, *TURNS, *SOLVES),
 )
-NO = ("N", "NO")
 ZOOMED = ("THI", "EPD", "FNO", "CIR", "TIT")
 # Control codes, fields, vignetting factors, weights and wavelengths, which move no ray in a zoom.
 NOT_ZOOMED = frozenset(
@@ -194,7 +194,7 @@ def _system(file: File, command: Command) -> bool:
     name, words, line = command.name, command.words, command.line
     match name:
         case "RDM":
-            file.radii = not (words and words[0].upper() in NO)
+            file.radii = not (words and words[0].upper() in ("N", "NO"))
         case "TIT" if words and words[0].upper().startswith("Z") and words[0][1:].isdecimal():
             file.zoom.titles[int(words[0][1:]) - 1] = " ".join(words[1:]).strip("\"' ")
         case "TIT":
@@ -245,7 +245,7 @@ def _surface(file: File, command: Command) -> None:
         case "STO":
             block.stop = True
         case "PIM":  # behind the image, too, it speaks of the last surface
-            file.blocks[-2 if file.closed else -1].solved = not (words and words[0].upper() in NO)
+            file.blocks[-2 if file.closed else -1].solved = not (words and words[0].upper() in ("N", "NO"))
         case "GLA":
             block.medium = medium(command, words, file.private)
         case "SPS" | "SCO":
@@ -404,9 +404,9 @@ def _complete(file: File) -> None:
 
     file.states = file.zoom.states(file.blocks, "position", "ZOO CIR", solve)
     file.object_distance, file.object_medium = first.thickness, first.medium
-    file.working = file.f_number is not None
-    if file.working and math.isfinite(first.thickness):
+    if file.f_number is not None and math.isfinite(first.thickness):
         assume(file.file, f"FNO {file.f_number:g} is taken as the f-number at the image of the near object")
+        file.image_f_number, file.f_number = file.f_number, None
     primary = file.waves_nm[file.reference - 1] if 0 < file.reference <= len(file.waves_nm) else 0.0
     file.wavelengths_nm = primary_first(file.waves_nm, primary)
     file.film_given = not (last.solved and last.thickness == defocus)
@@ -449,8 +449,8 @@ def medium(
     if len(pair) == 2:
         n_d, V_d = command.numbers(pair, 2)
         return {"n_d": n_d, "V_d": V_d}
-    if code := by_code(word):
-        return code
+    if code := figures_of_code(word):
+        return {"n_d": code[0], "V_d": code[1]}
     if re.fullmatch(r"[0-9.]+(e[+-]?[0-9]+)?", word, re.IGNORECASE):
         numbers = command.numbers(words[:2])
         return {"n_d": numbers[0], "V_d": numbers[1] if len(numbers) > 1 else None}

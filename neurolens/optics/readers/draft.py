@@ -215,9 +215,9 @@ class Draft:
     Attributes:
         kind: name of the format, for the source line.
         notes: lines of text.
-        pupil, f_number, object_na: if one is given, it sizes the stop, else the stop's diameter does. `object_na` is
-            the numerical aperture n sin(theta) of the beam from the axis of a near object.
-        working: whether the f-number of a near object is that of its image, not of an object at infinity.
+        pupil, f_number, object_na, image_f_number: if one is given, it sizes the stop, else the stop's diameter does.
+            `object_na` is the numerical aperture n sin(theta) of the beam from the axis of a near object,
+            `image_f_number` that of the beam to its image, in place of an object at infinity.
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
         drawn: whether somebody measured rims in a drawing, and gave some as radii in place of diameters. These are
@@ -239,7 +239,7 @@ class Draft:
     pupil: float | None = None
     f_number: float | None = None
     object_na: float | None = None
-    working: bool = False
+    image_f_number: float | None = None
     image_radius: float | None = None
     half_field_deg: float | None = None
     object_distance: float = math.inf

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lens import glass as catalogue
-from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass, by_figures
+from neurolens.optics.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass, by_figures, figures_of_code
 from neurolens.optics.lens.prescription import MediumFields
 from neurolens.optics.readers.source import Line, assume, read_lines, warn
 
@@ -48,12 +48,6 @@ _OFF = 1e-3  # a larger difference between n_d of the formula and of the NM line
 _DARKEST = 1e-6  # a transmittance of 0 says no more than that it is below this
 
 
-def by_code(word: str) -> MediumFields | None:
-    """Return the fields of a glass code, as `lens.glass.figures_of_code` reads it, else None."""
-    figures = catalogue.figures_of_code(word)
-    return {"n_d": figures[0], "V_d": figures[1]} if figures else None
-
-
 def named_glass(
     name: str,
     file: str,
@@ -78,8 +72,8 @@ def named_glass(
     """
     same = catalogue.same_name(name)
     stem, _, maker = name.rpartition("_")
-    if not same and (code := by_code(name)):
-        return code
+    if not same and (code := figures_of_code(name)):
+        return {"n_d": code[0], "V_d": code[1]}
     if not same and stem and maker.upper() in _NAMES:  # as CODE V writes it
         return named_glass(stem, file, field, [maker.upper()], text=name, figures=figures)
     if not same and not figures and (left := _DISCONTINUED.get(name.upper())):

@@ -12,18 +12,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from neurolens.base.errors import InputError
+from neurolens.optics.lens.glass import figures_of_code
 from neurolens.optics.lens.placement import Placement
 from neurolens.optics.lens.prescription import Lens
 from neurolens.optics.readers import draft
 from neurolens.optics.readers.assemble import lens_of
 from neurolens.optics.readers.breaks import Turn
 from neurolens.optics.readers.draft import INFINITE, UNKNOWN, Draft, Row, placed, primary_first
-from neurolens.optics.readers.glasses import by_code, by_indices, named_glass
+from neurolens.optics.readers.glasses import by_indices, named_glass
 from neurolens.optics.readers.source import MAX_INDEX, UNITS_MM, Line, ReadOptions, assume, by_word, read_lines, warn
 
 TURNS = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC")
-TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}  # and, as other programs write OSLO's files:
-MORE_TERMS = {"AH": 12, "AI": 14, "AJ": 16, "AK": 18}
+# From r^12 on as other programs write OSLO's files.
+TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10, "AH": 12, "AI": 14, "AJ": 16, "AK": 18}
 FIXED = {"RDF": "RD", "CVF": "CV", "THF": "TH", "APF": "AP", "GLF": "GLA", "AIF": "AIR"}  # with no solve or pickup
 # Designer, weights, settings of the program, drawings.
 HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
@@ -164,10 +165,10 @@ def _keyword(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "DT":
             if line.first(word, rest) != 1:
                 raise line.error(word, rest[0], "1: decentres before tilts")
-        case _ if word in ("RD", "CV", "TH", "CC", *TERMS, *MORE_TERMS, *TURNS):
+        case _ if word in ("RD", "CV", "TH", "CC", *TERMS, *TURNS):
             block.values[word] = line.first(word, rest)
-            if word in MORE_TERMS and block.values[word]:
-                assume(file.file, f"line {line.number}: {word} is taken as the coefficient of r^{MORE_TERMS[word]}")
+            if TERMS.get(word, 0) > 10 and block.values[word]:
+                assume(file.file, f"line {line.number}: {word} is taken as the coefficient of r^{TERMS[word]}")
         case _:
             file.skipped[word] += 1
 
@@ -179,7 +180,7 @@ def _glass(block: Block, line: Line, rest: list[str]) -> None:
     block.medium, block.glass, block.indices = {}, line, []
     if not rest:
         raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
-    if re.fullmatch(r"[0-9.]+", rest[0]) and not by_code(rest[0]):
+    if re.fullmatch(r"[0-9.]+", rest[0]) and not figures_of_code(rest[0]):
         block.indices = line.numbers("GLA", rest)
     elif rest[0].upper() in ("REFL", "RFL", "REFLECT"):
         raise line.error("GLA", rest[0], "a glass: the lens model has no mirrors")
@@ -213,8 +214,8 @@ def _complete(file: File) -> None:
     file.object_medium, file.wavelengths_nm = first.medium, primary_first(waves_nm, waves_nm[0] if waves_nm else 0.0)
     file.object_distance = math.inf if distance >= INFINITE else distance
     if file.pupil is not None and 0 < distance < INFINITE:  # EBR is measured at surface 1, not at the entrance pupil
-        slope = math.atan(file.pupil / 2 / distance)
-        file.object_na, file.pupil = first.medium.get("n_d", 1.0) * math.sin(slope), None
+        sine = file.pupil / math.hypot(file.pupil, 2 * distance)
+        file.object_na, file.pupil = sine * first.medium.get("n_d", 1.0), None
     file.film_given = not (last.solved and "TH" not in last.values)
 
 
@@ -223,7 +224,6 @@ def _row(block: Block) -> Row:
     block.curvature, block.thickness, block.conic = (values.get(key, 0.0) for key in ("CV", "TH", "CC"))
     radius = values.get("RD") or block.radius
     block.curvature = 1 / radius
-    powers = TERMS | MORE_TERMS
-    terms = sorted((powers[name], value) for name, value in values.items() if name in powers)
+    terms = ((TERMS[name], value) for name, value in sorted(values.items()) if name in TERMS)
     # The radius is taken as printed, not as the inverse of its inverse.
     return block.row(block.rotational(terms) | {"radius_mm": radius})

@@ -256,9 +256,8 @@ def decode(raw: bytes, path: str | Path) -> str:
         if control is None:
             return text.replace("\x1a", "")  # the end mark of old DOS files
         break
-    packed = Path(path).suffix.lower() in (".zar", ".zos")
-    hint = ": an archive of Zemax; give the lens file (.zmx) that it holds" * packed
-    raise InputError(path, "file", "(bytes that are not text)", f"a text file in UTF-8, UTF-16 or Latin-1{hint}")
+    zar = " (of an archive of Zemax, give the .zmx that it holds)" * str(path).lower().endswith(".zar")
+    raise InputError(path, "file", "(bytes that are not text)", f"a text file in UTF-8, UTF-16 or Latin-1{zar}")
 
 
 def lines_of(text: str) -> list[str]:

@@ -99,6 +99,7 @@ class File(Draft):
     zoom: Positions = field(default_factory=Positions)
     makers: list[str] = field(default_factory=list)
     without_film: bool = False
+    working: bool = False  # whether the f-number is that at the image
     field_type: int = 0
     fields: int = 0
     heights: dict[str, list[float]] = field(default_factory=dict)
@@ -183,8 +184,7 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             file.working = rest[1:2] == ["1"]
         case "OBNA":
             if rest[1:2] == ["1"]:
-                expected = "a numerical aperture, with flag 0: an angle of the object's cone is not read"
-                raise line.error(word, " ".join(rest), expected)
+                raise line.error(word, " ".join(rest), "a numerical aperture, with flag 0: a cone's angle is not read")
             file.object_na = line.positive(word, rest[:1])
         case "ENVD":
             if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
@@ -384,6 +384,8 @@ def _complete(file: File) -> None:
         raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
     if image.curvature or any(value for value, _ in image.parameters.values()):
         warn(file.file, "the image surface is curved; the film is taken as plane")
+    if file.working and math.isfinite(first.thickness):
+        file.image_f_number, file.f_number = file.f_number, None
     last = middle[-1]
     file.notes = ["\n".join(file.notes).strip()]
     file.object_distance, file.object_medium = first.thickness, first.medium

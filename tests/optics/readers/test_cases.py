@@ -350,7 +350,7 @@ def test_old_glasses_and_trade_names_are_known(name: str, n_d: float, tmp_path: 
 
 def test_an_archive_says_what_to_give_instead(tmp_path: Path) -> None:
     (tmp_path / "lens.zar").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match=r"an archive of Zemax; give the lens file \(.zmx\)"):
+    with pytest.raises(InputError, match=r"of an archive of Zemax, give the .zmx that it holds"):
         read_any(tmp_path / "lens.zar")
 
 

@@ -155,6 +155,13 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
     assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, ReadOptions(units="in")) == inches
 
 
+def test_a_film_in_the_hole_of_a_pinhole_is_refused(tmp_path: Path) -> None:
+    hole = HEAD + 'SURF 1\n  STOP\n  CURV 0\n  DISZ 20\n  DIAM 0.1 1 0 0 1 ""\n' + TAIL.replace("SURF 3", "SURF 2")
+    assert first_order(read(hole, tmp_path)).efl_mm == 20
+    with pytest.raises(InputError, match=r"film: got \(in the hole of a pinhole\)"):
+        read(hole.replace("DISZ 20", "DISZ 0"), tmp_path)
+
+
 def test_an_image_under_water_is_no_file_cut_off(tmp_path: Path) -> None:
     """Programs repeat the medium of the image behind it."""
     glass = "GLAS ___BLANK 1 0 1.333 55.8"
