@@ -106,6 +106,16 @@ def test_without_a_compiler_a_camera_runs_in_onnxruntime(monkeypatch: pytest.Mon
         ExactCamera(lens_models.lens(), Shot(FILM, 2.0, 8.0, runtime="c"), bounds=lens_models.domain().bounds)
 
 
+def test_a_compiler_that_fails_leaves_a_camera_to_onnxruntime(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "false")
+    made = lens_models.exact_camera.__wrapped__(2.0, 8.0)
+    film, square = np.zeros((2, 3), np.float32), np.full((2, 3), 0.4, np.float32)
+    few, rays = (take(film, square, np.full(3, 550, np.float32)) for take in (made.sample_few, made.sample))
+    assert made.runtime == made.settings["runtime"] == "onnxruntime" and (rays.status == 0).all()
+    np.testing.assert_allclose(few.direction, rays.direction, atol=1e-6)
+    np.testing.assert_allclose(few.weight, rays.weight, rtol=1e-5)
+
+
 def test_focus_that_no_film_plane_reaches() -> None:
     with pytest.raises(InputError, match="focus_m"):
         ExactCamera(lens_models.lens(), Shot(FILM, 0.1))
