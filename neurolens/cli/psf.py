@@ -140,7 +140,7 @@ examples:
             settings["model"] = {"file": self.file.name, "errors": loaded.card["errors"]}
         facts = about(lens, settings, waves)
         write(arrays, facts)
-        forget_parts(folder, "*.npz")
+        forget_parts(folder, "[!.]*.npz")  # another run may be about to write one
         if self.plot is not None:
             from neurolens.optics.analysis.plots import plot_point_spread
 

@@ -48,7 +48,7 @@ class Blur:
         about, arrays = file if isinstance(file, tuple) else read_psf(Path(file))
         if not all(0 <= k < n for k, n in zip(state, arrays["psf"].shape[:2], strict=True)):
             raise InputError("blur", "state", state, f"below {arrays['psf'].shape[:2]}, the file's states")
-        if any(2 * abs(place) > side for place, side in zip(at_mm, about["film_mm"], strict=True)):
+        if not all(2 * abs(place) <= side for place, side in zip(at_mm, about["film_mm"], strict=True)):
             raise InputError("blur", "at_mm", at_mm, "a place on the film of {:g} x {:g} mm".format(*about["film_mm"]))
         kernels, pixel_mm = arrays["psf"][state].astype(np.float64), about["pixel_um"] / 1000
         self.size, self.channels, self.radius = size, kernels.shape[2], kernels.shape[-1] // 2
@@ -76,8 +76,10 @@ class Blur:
         return self._applied(blurred, adjoint=True)
 
     def _applied(self, picture: Tensor, adjoint: bool) -> Tensor:
-        if picture.shape != (self.channels, *self.size):
-            raise InputError("blur", "picture", tuple(picture.shape), f"{(self.channels, *self.size)}")
+        if picture.shape != (self.channels, *self.size) or not picture.is_floating_point():
+            raise InputError(
+                "blur", "picture", f"({picture.dtype} {tuple(picture.shape)})", f"floats {(self.channels, *self.size)}"
+            )
         r, (height, width) = self.radius, self.size
         room = torch.nn.functional.pad(picture, (r, r, r, r))
         found = torch.zeros_like(room)
@@ -127,8 +129,9 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
         for name in ("pictures", "files"):
             if isinstance(given := getattr(self, name), str | Path) or not len(given):
                 raise InputError("pairs", name, given, "a list of at least one")
-        if self.patch != int(self.patch) or self.patch < 1:
-            raise InputError("pairs", "patch", self.patch, "a whole number of pixels, at least 1")
+        for name, least in (("patch", 1), ("seed", 0), ("length", 1)):
+            if (number := getattr(self, name)) is not None and (number != int(number) or number < least):
+                raise InputError("pairs", name, number, f"a whole number, at least {least}")
         self._lenses = [read_psf(Path(file)) for file in self.files]
         for file, (_, arrays) in zip(self.files, self._lenses, strict=True):
             if arrays["psf"].shape[4] != 3:
@@ -147,8 +150,8 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
             picture = read_picture(Path("pairs"), "picture", Path(picture))
         picture = np.asarray(picture)
         if picture.shape[2:] != (3,) or picture.dtype.kind != "f":  # whole numbers, as PNG has them, are not linear
-            found = f"({picture.dtype} {picture.shape})"
-            raise InputError("pairs", "picture", found, "floats [H, W, 3] of linear sRGB, or the name of a file")
+            expected = "floats [H, W, 3] of linear sRGB, or the name of a file"
+            raise InputError("pairs", "picture", f"({picture.dtype} {picture.shape})", expected)
         if min(picture.shape[:2]) < self.patch:
             raise InputError("pairs", "picture", picture.shape, f"at least {self.patch} pixels a side")
         about, arrays = self._lenses[random.integers(len(self._lenses))]

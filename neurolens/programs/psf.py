@@ -17,6 +17,7 @@ upright: row 0 is its top.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,11 @@ from neurolens.pictures.defocus.diffraction import Channels, spreads
 from neurolens.pictures.render.film import digest
 
 Arrays = dict[str, NDArray[Any]]
-_NAMES = ("psf", "centre_mm", "inside", "light", "by_rays", "differs", "place_mm", "f_number", "distance_m")
+_ARRAYS = {  # and their axes: f-numbers N, distances D, rows R, columns K, channels C, the sides S
+    "psf": "NDRKCSS", "centre_mm": "NDRK2", "inside": "NDRKC", "light": "NDRK", "by_rays": "NDRK", "differs": "NDRK",
+    "place_mm": "RK2", "f_number": "N", "distance_m": "D",
+}  # fmt: skip
+_NAMES = tuple(_ARRAYS)
 
 
 @dataclass(frozen=True)
@@ -100,26 +105,26 @@ def library_of(
         NeurolensError: a part has failed; the others are kept. Lost: the executor has failed.
     """
     tasks = [replace(task, lens=lens, distance_m=d) for lens in lenses.values() for d in distances_m]
-    parts = [folder / f"{digest([__version__, each])}.npz" for each in tasks]
-    named = dict(zip(map(id, tasks), parts, strict=True))
-    missing = [each for each in tasks if not named[id(each)].is_file()]
-    folder.mkdir(exist_ok=True)
+    parts = {id(each): folder / f"{digest([__version__, each])}.npz" for each in tasks}
+    found = dict[Path, Arrays]()
+    # Damaged parts are made again. Another run into the same file removes all when it ends.
+    for part in parts.values():
+        with suppress(FileNotFoundError, ValueError), read_arrays(part) as (_, read):
+            found[part] = {name: read(name) for name in _NAMES[:6]}
     with progress.stage(f"point spread at {len(task.places_mm) - 1} places, {len(tasks)} states") as report:
-        for done, (each, answer) in enumerate(run_each(executor, point_spread, missing), 1):
+        for each, answer in run_each(executor, point_spread, [t for t in tasks if parts[id(t)] not in found]):
             if isinstance(answer, Failed):
                 raise NeurolensError(f"point spread at {each.distance_m:g} m: {answer.reason}; {how_to_resume(folder)}")
-            write_arrays(named[id(each)], {}, answer)
-            report((len(tasks) - len(missing) + done) / len(tasks))
-    found = []
-    for part in parts:
-        with read_arrays(part) as (_, read):
-            found.append({name: read(name) for name in _NAMES[:6]})
-    side = max(made["psf"].shape[-1] for made in found)
-    for made in found:
+            folder.mkdir(exist_ok=True)
+            write_arrays(parts[id(each)], {}, answer)
+            found[parts[id(each)]] = answer
+            report(len(found) / len(tasks))
+    side = max(made["psf"].shape[-1] for made in found.values())
+    for made in found.values():
         room = (side - made["psf"].shape[-1]) // 2
         made["psf"] = np.pad(made["psf"], [(0, 0), (0, 0), (room, room), (room, room)])
     states, (columns, rows) = (len(lenses), len(distances_m)), grid
-    arrays = {name: np.array([made[name] for made in found]) for name in found[0]}
+    arrays = {name: np.array([found[part][name] for part in parts.values()]) for name in _NAMES[:6]}
     return {
         **{name: a.reshape(*states, rows, columns, *a.shape[2:]) for name, a in arrays.items()},
         "place_mm": np.array(task.places_mm[:-1]).reshape(rows, columns, 2),
@@ -136,7 +141,14 @@ def read_psf(path: Path) -> tuple[dict[str, Any], Arrays]:
     """
     try:
         with read_arrays(path, _NAMES) as (about, read):
-            return dict(about), {name: read(name) for name in _NAMES}
+            arrays, about = {name: read(name) for name in _NAMES}, dict(about)
+        sizes = (zip(axes, arrays[name].shape, strict=True) for name, axes in _ARRAYS.items())
+        if (
+            len(known := {("2", 2), *(one for some in sizes for one in some)}) > len(dict(known))
+            or not {"film_mm", "pixel_um"} <= about.keys()
+        ):
+            raise ValueError("shapes that do not fit each other, or about.json without film_mm and pixel_um")
+        return about, arrays
     except ValueError as error:
         raise InputError(path, "file", f"({error})", "a file of neurolens psf (.npz)") from None
 
@@ -149,17 +161,17 @@ def channels_of_exr(arrays: Arrays, names: Sequence[str]) -> Arrays:
         for d, distance in enumerate(arrays["distance_m"]):
             for c, name in enumerate(names):
                 layer = f"f{f_number:g}_{distance:g}m".replace(".", "p")
-                atlas = psf[n, d, :, :, c].transpose(0, 2, 1, 3).reshape(rows * side, columns * side)
-                planes[f"{layer}.{name}"] = atlas
+                images = psf[n, d, :, :, c].transpose(0, 2, 1, 3)
+                planes[f"{layer}.{name}"] = images.reshape(rows * side, columns * side)
     return planes
 
 
 def about(lens: Lens, settings: Mapping[str, Any], channels: Channels) -> dict[str, Any]:
     """Return what about.json says: units, channels, the lens and how photographs of the product agree with it."""
     row = read_index().get(f"{lens.lens_id}.toml", {}).get("row", {})
-    checked = {key: row.get(key) for key in ("match", "verdict")}
-    units = "lengths in mm, distances in m; psf: shares of a channel's light by pixel; rows from the top, upright"
     return dict(plain({
-        "neurolens": __version__, "lens": lens.lens_id, "name": lens.name, "photographs": checked, "units": units,
+        "neurolens": __version__, "lens": lens.lens_id, "name": lens.name,
+        "photographs": {key: row.get(key) for key in ("match", "verdict")},
+        "units": "lengths in mm, distances in m; psf: shares of a channel's light by pixel; rows from the top, upright",
         "channels": channels, **settings,
     }))  # fmt: skip

@@ -12,7 +12,7 @@ import torch
 from command_line import failure, run_json
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import library
+from neurolens.base.files import forget_parts, library, write_arrays
 from neurolens.cameras.build import make_camera
 from neurolens.cli import main
 from neurolens.optics.analysis.diffraction import pupils_at, spread
@@ -114,6 +114,19 @@ def test_parts_that_are_done_are_not_computed_again(tmp_path: Path, monkeypatch:
     assert computed == [1, 3, 3] and p.read_psf(out)[1]["psf"].shape == (1, 2, 2, 3, 1, 9, 9)
 
 
+def test_runs_into_one_file_do_not_end_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another one that ends first removes all parts that are there."""
+    out, one = tmp_path / "a.npz", p.point_spread
+
+    def beside(task: p.PsfTask) -> p.Arrays:
+        forget_parts(out.with_name("a.npz.parts"), "*.npz")
+        return one(task)
+
+    monkeypatch.setattr(p, "point_spread", beside)
+    words = ("--distance", "1", "3", "--side", "9", "--f-number", "5.6", "--wavelengths", "550", "-o", str(out))
+    assert main([*WORDS, *words]) == 0 and p.read_psf(out)[1]["distance_m"].tolist() == [1, 3]
+
+
 def test_an_exr_holds_the_atlas_of_each_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = {"--wavelengths": "550", "--side": 15, "--f-number": 5.6, "--plot": tmp_path / "a.svg"}
     data = run_json(capsys, *WORDS, *(w for pair in words.items() for w in pair), "-o", tmp_path / "a.exr")
@@ -182,6 +195,19 @@ def test_a_file_of_other_arrays_is_refused(tmp_path: Path) -> None:
         Blur(tmp_path / "a.npz", (8, 8))
 
 
+def test_arrays_that_do_not_fit_each_other_are_refused(made: Path, tmp_path: Path) -> None:
+    about, arrays = p.read_psf(made)
+    for changed, facts in (
+        ({"place_mm": arrays["place_mm"][:1]}, about),
+        ({"psf": arrays["psf"][..., 1:]}, about),
+        ({"light": arrays["light"][..., None]}, about),
+        ({}, {"lens": LENS}),
+    ):
+        write_arrays(tmp_path / "a.npz", facts, arrays | changed)
+        with pytest.raises(InputError, match="a file of neurolens psf"):
+            Blur(tmp_path / "a.npz", (8, 8))
+
+
 def noise(*shape: int) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(3).standard_normal(shape))
 
@@ -236,6 +262,8 @@ def test_pairs_have_the_blur_and_the_noise_of_the_sensor(made: Path) -> None:
         ({"files": "library.npz"}, "files.*a list"),
         ({"patch": 0}, "patch.*at least 1"),
         ({"patch": 9.5}, "patch.*whole number"),
+        ({"length": 0}, "length.*at least 1"),
+        ({"seed": -1}, "seed.*at least 0"),
         ({"pictures": [np.full((40, 40, 3), 128, np.uint8)]}, "uint8.*floats"),  # sRGB, or light? nobody can tell
         ({"pictures": [np.zeros((40, 40))]}, "float64 .40, 40.*floats"),
         ({"pictures": [np.zeros((40, 40, 4))]}, "40, 40, 4.*floats"),
@@ -258,5 +286,8 @@ def test_a_state_or_a_place_that_is_not_there_is_refused(made: Path) -> None:
         Blur(made, (8, 8), at_mm=(4.0, 10.5))
     with pytest.raises(InputError, match="the file's states"):
         Blur(made, (8, 8), state=(2, 0))
-    with pytest.raises(InputError, match="picture"):
-        Blur(made, (8, 8))(torch.zeros(3, 8, 9))
+    with pytest.raises(InputError, match="at_mm"):
+        Blur(made, (8, 8), at_mm=(math.nan, 0.0))
+    for picture in (torch.zeros(3, 8, 9), torch.zeros(3, 8, 8, dtype=torch.int64)):
+        with pytest.raises(InputError, match="picture"):
+            Blur(made, (8, 8))(picture)
