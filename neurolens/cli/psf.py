@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from neurolens.base.errors import note
+from neurolens.base.errors import note, warn
 from neurolens.base.files import forget_parts, how_to_resume, write_arrays
 from neurolens.base.lensname import is_model
 from neurolens.base.report import Report
@@ -154,8 +154,8 @@ examples:
             least_inside=inside, cpu_s_a_psf=None if self.dask else (time.process_time() - began) / count,
         )  # fmt: skip
         if not lit.all():
-            unknown = ", or the model knows no image there: trace the lens file" if loaded else ""
-            note(f"{count - int(lit.sum())} of {count} point spreads are dark: no light arrives{unknown}")
+            dark = f"{count - int(lit.sum())} of {count} point spreads are dark: no light arrives"
+            warn(f"{dark}, or the model knows no image there: trace the lens file") if loaded else note(dark)
         if inside < 0.9:
             note(f"at some places {1 - inside:.0%} of the light lies beyond {found.side_px} pixels")
         return self.answer(found)

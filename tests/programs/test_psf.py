@@ -136,6 +136,13 @@ def test_an_exr_holds_the_atlas_of_each_state(tmp_path: Path, capsys: pytest.Cap
     assert json.loads(json.dumps(about))["channels"] == {"nm550": [550.0]}
 
 
+def test_dark_places_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--film", "300x10", "--grid", "3x1", "--pixel-um", "8", "--side", "9", "--wavelengths", "550"]
+    assert main(["psf", LENS, *words, "-o", str(tmp_path / "a.npz")]) == 0
+    told = capsys.readouterr()
+    assert "2 of 3 point spreads are dark: no light arrives\n" in told.err and "at least 9" in told.out
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

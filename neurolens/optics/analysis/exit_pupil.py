@@ -46,7 +46,6 @@ _ON = np.array([[k in side[::2] for side in _CORNERS] for k in range(4)], np.flo
 _LINES = [np.kron([0.5 - _NODES, 0.5 + _NODES], way).astype(np.float32) for way in ([[1], [0]], [[-1], [1]])]
 _HALVINGS = 6  # of a line, to find where a blade or a mask ends its lit part
 _ROOM = 1.1  # the box of cosines over the rays that pass, between which edges lie
-_TINY = 1e-12  # in place of zero, to divide by
 _FLAT = 1e-6  # a beam of less half width, in cosines, does not meet on the film
 
 
@@ -92,10 +91,6 @@ class ExitPupil:
         at = self._at(places, slice(2, None))
         at = at.reshape(len(self.limits_mm), 2, *at.shape[1:])
         return _lets(self.aperture, (at.T / self.limits_mm).T)[0]
-
-    def open_share(self, cells: int) -> Array:
-        """Return the share [cells, cells] of each cell of the box that light passes, as `open_shares`."""
-        return np.asarray(open_shares([self], (cells, cells))[0][0], np.float64)
 
     def field(self, places: Array | tuple[Array, ...]) -> NDArray[np.complex64]:
         """Return sqrt(e) exp(i k W) at points, which are as in `passes`."""
@@ -145,8 +140,9 @@ def open_shares(pupils: Sequence[ExitPupil], cells: tuple[int, ...]) -> tuple[ND
     limits = np.array([p.limits_mm + p.limits_mm[:1] * k for p, k in zip(pupils, lack, strict=True)])
     kept = [[*range(2, 2 + 2 * (rims - k)), *[2, 3] * k] for k in lack]
     series = np.array([p.figures.take(k, -1) for p, k in zip(pupils, kept, strict=True)], np.float32)
+    series /= limits.repeat(2, 1)[:, None, None]
     at = summed(series.transpose(3, 0, 1, 2), tuple(np.linspace(-1, 1, n + 1) for n in cells))
-    at = at.reshape(rims, 2, *at.shape[1:]) / limits.T.astype(np.float32)[:, None, :, None, None]
+    at = at.reshape(rims, 2, *at.shape[1:])
     lit, height = _lets(aperture, at)
     bits = lit.view(np.int8)
     bits = bits[:, :-1] + 2 * bits[:, 1:]
@@ -156,36 +152,37 @@ def open_shares(pupils: Sequence[ExitPupil], cells: tuple[int, ...]) -> tuple[ND
     (w, i, j), wide = np.unravel_index(edge, bits.shape), cells[1] + 2
     first, steps = (w * (cells[0] + 1) + i) * (wide - 1) + j, np.array([0, wide - 1, 1, wide])
     # From the lit side; of two that are lit alike, from that where light passes farther from the rims.
-    light = (lit - 0.1 * height).reshape(-1)[first[:, None] + steps]
-    side = (light @ _ON).argmax(1)
+    side = ((lit - 0.1 * height).reshape(-1)[first[:, None] + steps] @ _ON).argmax(1)
     corner = first[:, None] + steps[_CORNERS][side]
     ends = at.reshape(rims, 2, -1).take(corner, 2)
     cuts = ((ends * ends).sum(1).max((1, 2), initial=0) > 1) | (np.arange(rims) == 0)
     begin, way = (ends[cuts] @ line for line in _LINES)
     a, b, c = (way * way).sum(1), (way * begin).sum(1), 1 - (begin * begin).sum(1)
-    part = (c / np.maximum(b + np.sqrt(np.maximum(b * b + a * c, 0)), _TINY)).min(0).clip(0, 1)
+    part = (c / np.maximum(b + np.sqrt(np.maximum(b * b + a * c, 0)), 1e-12)).min(0).clip(0, 1)
     if aperture is not None:
         known = 0 * part
         for _ in range(_HALVINGS):
             part = part / 2
-            x, y = begin[0] + (known + part) * way[0]
-            known += part * aperture.inside(x, y, 1.0)
+            known += part * aperture.inside(*(begin[0] + (known + part) * way[0]), 1.0)
         part = known + part / 2
     given = np.concatenate([part, part * part, part * part * part], 1) @ _MOMENTS
     about = np.add.outer(np.arange(3) * wide, np.arange(3))
     about = np.stack([about, about[::-1], about.T, about.T[::-1]]).reshape(4, 9)
     place = ((w * (cells[0] + 2) + i) * wide + j)[:, None] + about[side]
     shape = len(pupils), cells[0] + 2, wide
-    weight = np.bincount(place.reshape(-1), given.reshape(-1), math.prod(shape)).reshape(shape)[:, 1:-1, 1:-1]
-    weight = _nearby(cells[0]) @ whole @ _nearby(cells[1]) + weight.astype(np.float32)
+    edges = np.bincount(place.reshape(-1), given.reshape(-1), math.prod(shape)).reshape(shape)[:, 1:-1, 1:-1]
+    weight = _nearby(_nearby(whole).swapaxes(1, 2)).swapaxes(1, 2) + edges.astype(np.float32)
     whole.reshape(-1)[edge] = given @ np.ones(9, np.float32)
     return whole, weight
 
 
-@lru_cache(maxsize=64)
-def _nearby(cells: int) -> Array:
-    """Return the matrix [cells, cells] that gives the middles on a line what whole cells weigh."""
-    return np.asarray(sum(np.eye(cells, k=k) * m for k, m in zip((-1, 0, 1), _GROWN.sum(1), strict=True)), np.float32)
+def _nearby(whole: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what the middles [W, N, M] weigh for cells that are whole, along their lines."""
+    before, own, after = _GROWN.sum(1).astype(np.float32)
+    found = own * whole
+    found[:, :-1] += before * whole[:, 1:]
+    found[:, 1:] += after * whole[:, :-1]
+    return np.asarray(found)
 
 
 def _lets(aperture: Aperture | None, at: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -23,7 +23,7 @@ from neurolens.optics.analysis.diffraction import (
     pupils_at,
     spread,
 )
-from neurolens.optics.analysis.exit_pupil import ExitPupil, _least
+from neurolens.optics.analysis.exit_pupil import ExitPupil, _least, open_shares
 from neurolens.optics.analysis.field_curves import illumination
 from neurolens.optics.analysis.fields import Scene
 from neurolens.optics.analysis.psf import psf
@@ -56,7 +56,7 @@ def test_a_perfect_lens_has_airys_disc() -> None:
     # Cells may be few in focus, for edges are found within them.
     pupil = pupil_of(given)
     for cells in (24, 64):
-        area = 4 * pupil.half.prod() * pupil.open_share(cells).mean()
+        area = 4 * pupil.half.prod() * open_shares([pupil], (cells, cells))[0].mean()
         assert area == pytest.approx(math.pi / (2 * n) ** 2, rel=1e-4)
 
 
@@ -170,7 +170,7 @@ def test_blades_stay_where_they_are_all_over_the_film() -> None:
     given = library("laikin_double_gauss_50", f_number=8.0)
     given = Scene(replace(given.lens, aperture=Aperture(blades=4)))
     for found in pupils_at(given, np.array([[9.0, 9.0], [0.0, 0.0]]), [D]):
-        share = found[0].open_share(64)  # a square on its corner
+        share = open_shares([found[0]], (64, 64))[0][0]  # a square on its corner
         assert share.mean() == pytest.approx(0.5 / 1.08**2, rel=0.03)
         assert share[2, 2] == share[-3, 2] == 0 and share[32, 32] == 1
 
@@ -212,7 +212,7 @@ def test_a_pupil_whose_rims_cut_no_cell_is_closed_or_the_whole_box(wide: float, 
     """Its image has no light then, or all that the box lets through."""
     pupil = pupil_of(library("laikin_double_gauss_50", f_number=4.0))
     pupil = replace(pupil, limits_mm=tuple(wide for _ in pupil.limits_mm))
-    assert np.all(pupil.open_share(64) == share)
+    assert np.all(open_shares([pupil], (64, 64))[0] == share)
     found = spread([pupil], ONE, 0.003, 33)
     assert float(found.inside[0]) <= share and bool(found.pupil[0]) is bool(share)
 
