@@ -102,7 +102,8 @@ class Rims(cli.Figures):
 
     On each side of the stop either the rims are scaled, or a ring of the mount is added; the fit takes all apertures
     together. Nothing cuts the beam of the axis, and no rim is wider than its neighbours allow. What is left has other
-    causes: the sensor's shading, or a product that differs from the table. The profile is found as by `neurolens
+    causes: the sensor's shading, or a product that differs from the table. A zoom is fitted at its shortest focal
+    length, and `neurolens verify` of the new file says how its others fare. The profile is found as by `neurolens
     verify`. Needs the extras "train" and "photographs".
 
     With --copy it finds what is off in one copy instead, from the contrasts that its photographs show in the middle and
