@@ -36,13 +36,12 @@ RUNTIMES: tuple[Runtime, ...] = ("onnxruntime", "c")
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(tmp_path_factory: pytest.TempPathFactory) -> object:
-    """Compiled with less effort, into a folder of the tests; -O3 is for those who render."""
+    """Compiled into a folder of the tests."""
     try:
         compiler.find_compiler()
     except InputError as reason:
         pytest.skip(f"nothing is compiled here: {reason}")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiler, "FLAGS", ("-std=c99", "-O1", "-march=native"))
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
 
