@@ -232,7 +232,7 @@ class Lens(_Chosen):
 
     @property
     def t_stop(self) -> float:
-        """The f-number of a lens without loss that sends as much light to the axis, from 400 to 700 nm."""
+        """The f-number of a lens without loss that sends as much light of the d line to the axis."""
         return self._figures["t_stop"]
 
     @property

@@ -84,7 +84,8 @@ class ExactCamera(LensCamera):
 
     Args:
         lens: as its file has it, or in a zoom state.
-        shot: the settings of the camera; the d line stands in for the light of a lens without known dispersion.
+        shot: the settings of the camera. The outline of a lens without known dispersion is that of the d line; its
+            exposure is that of all light, which coatings colour.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
         progress: shows the search for the outline, where no run has kept it (`kept_outline`).
@@ -102,9 +103,8 @@ class ExactCamera(LensCamera):
         self.film_mm, self.path, self.name = shot.film_mm, Path(lens.path), lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = shot.wavelength_nm if self.dispersive else None
-        self._range_nm = shot.wavelength_nm
-        self._light_nm = used = shot.wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
-        for nm in used:
+        self._light_nm = shot.wavelength_nm
+        for nm in self._light_nm:
             check_light(lens, nm)
         self.lens = require_film(set_lens(lens, replace(shot, focus_m=given.focus_m)))
         shot = replace(shot, focus_m=focus_of(self.lens, given), focus_mode=focus_mode_of(self.lens, given))
@@ -122,7 +122,7 @@ class ExactCamera(LensCamera):
             "derived": self.lens.derived,
             "rims": lens.rims,
             "coatings": self.lens.coatings,
-            "lens_state": state_of(self.lens, used, float(first_order(tabled).efl_mm)),
+            "lens_state": state_of(self.lens, self._light_nm, float(first_order(tabled).efl_mm)),
         }
         self.place(self._outline(scene, plane, bounds, shot, progress), scene, shot, about, progress)
 
@@ -147,7 +147,7 @@ class ExactCamera(LensCamera):
         planes = (self.film.film_z_mm, self.film.outline.pupil_z_mm)
         places = np.concatenate([np.stack([x, y]) + (at - z) / dz * np.stack([dx, dy]) for at in planes])
         # The lens's graph takes light of the camera's range alone; so does this.
-        low, high = light_limits(self.lens, self._range_nm)
+        low, high = light_limits(self.lens, self._light_nm)
         inside = (low <= wavelength_nm) & (wavelength_nm <= high)
         return places, through, np.where(inside, done.status.numpy(), st.OUTSIDE_DOMAIN).astype(np.int32)
 
@@ -185,7 +185,8 @@ class ExactCamera(LensCamera):
         self, scene: LensScene, pupil_z_mm: float, bounds: PupilBounds | None, shot: Shot, progress: Progress | None
     ) -> PupilOutline | None:
         """Return the outline of what passes the lens with a round stop, from the cache where an earlier run kept it."""
-        lens, planes, light = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm), self._light_nm
+        lens, planes = replace(scene, aperture=None), (scene.film_z_mm, scene.film_z_mm)
+        light = self._light_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         covered = FilmPose.of(shot).covers_mm(self.film_mm, scene.film_z_mm - pupil_z_mm)
         # A lens that is not round takes a search at many azimuths, for one outline that fits none closely: so it is
         # coarser.

@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -170,7 +171,8 @@ class LensCamera:
         edge = edge[ray // 8 % edge.size]
         square[ray // 2 % 2, ray] = np.where(ray // 4 % 2, edge, 1 - edge)
         waves, points = rng.uniform(*self._light_nm, _EDGE_RAYS).astype(np.float32), film.astype(np.float32)
-        found = self.film.scene(*self.film.start(points, square, waves)[:2], waves)
+        scene = replace(self.film.scene, aperture=None)  # at whose edge no ray may pass
+        found = scene(*self.film.start(points, square, waves)[:2], waves)
         return FrontDiscs.of(found.scene_ray[:, found.status == st.PASSED].astype(np.float64), self.front)
 
     def compiled(self) -> Self:

@@ -19,8 +19,10 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import PROJECTIONS, Pinhole, ThickLens, ThinLens
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.reduced import Vignetted
+from neurolens.cameras.sampling import stratified
 from neurolens.optics.lens.paraxial import first_order
 from neurolens.optics.lens.shot import Shot
+from neurolens.optics.readers.lensfile import read_lens
 from neurolens.optics.setting.states import set_lens
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -55,6 +57,14 @@ def test_film_values_of_white_surroundings(kind: str) -> None:
     found = np.array([film_value(camera(kind), (0.8 * r, -0.6 * r), wavelength_nm=550.0) for r in RADII])
     assert film_value(camera(kind), (0.0, 0.0)) == pytest.approx(1, abs=1e-3)
     assert found / found[0] == pytest.approx(expected(kind), abs=1.2e-3)
+
+
+def test_white_is_1_on_the_axis_of_a_coated_lens_whose_glasses_have_no_known_dispersion() -> None:
+    """Its coatings colour the light, all of which the exposure counts."""
+    lens = read_lens(MODELS.parent / "lenses" / "tronnier_double_gauss_100.toml")
+    made = ExactCamera(lens, Shot((6.0, 4.0), f_number=4.0, coating="v-coat", runtime="onnxruntime"))
+    square, nm = stratified(64, (400.0, 700.0))
+    assert made.sample(np.zeros_like(square), square, nm).weight.mean() == pytest.approx(1.0, abs=3e-3)
 
 
 def test_models_of_anamorphic_lenses_are_lit_at_every_azimuth() -> None:
