@@ -12,6 +12,7 @@ from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.shot import Shot
 
 IDEAL = ("pinhole", "thin", "thick", *FISHEYES)
@@ -132,6 +133,14 @@ def test_a_small_light_in_focus_on_the_axis_in_closed_form(lens: Any) -> None:
     moved[0] = step
     magnification = float(np.median(lens.to_film(moved, square, wavelength).film_mm[0])) / (1e3 * step)
     assert light == pytest.approx((1e3 * magnification) ** 2, rel=2e-3)
+
+
+def test_three_blades_take_light_as_evenly_as_a_round_stop(model: OnnxCamera) -> None:
+    """Over the exposure, which counts them, too: no ray at the edge of the round outline passes three blades."""
+    blades = OnnxCamera(model.model, Shot(FILM, 2.0, 4.0, aperture=Aperture(3), wavelength_nm=(400.0, 700.0)))
+    point, square = np.repeat([[0.0], [0.0], [-2.0]], 1 << 14, axis=1).astype(np.float32), jittered(1 << 7)[0]
+    light = [made.to_film(point, square, np.full(1 << 14, 550, np.float32)).weight.mean() for made in (model, blades)]
+    assert light[1] == pytest.approx(light[0], rel=0.02)
 
 
 @pytest.mark.parametrize("kind", [*IDEAL, "exact", "model"])

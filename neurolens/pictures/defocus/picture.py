@@ -18,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ SAMPLES, _LEAST = 128, 8  # samples of a pixel: by default, and at least
 _FULL, _FULL_PX = 0.25, 2.0
 _CLEAR = 0.01  # share of its inverse depth by which something must be nearer to hide a point
 _SAID = 0.002  # a share of made-up light from which there is a warning
-_EDGE = 9  # points that are tried along each side of the film
+_EDGE, _TRIED = 9, 6  # points that are tried along each side of the film, and across a pupil that is dark in the middle
 _WINDOW = 33  # pixels across the surroundings
 # a highlight is so many times as bright as the geometric mean of its surroundings, and as their mean
 _BRIGHTER, _ABOVE = 8.0, 3.0
@@ -391,8 +392,10 @@ def check_field(camera: Camera) -> None:
     film = np.stack(np.meshgrid(side * width, side * height), 0).reshape(2, -1).astype(np.float32)
     low, high = camera.wavelength_nm or LIGHT_NM
     nm = np.full(film.shape[1], min(max(550.0, low), high), np.float32)
-    rays = camera.sample(film, np.full(film.shape, 0.5, np.float32), nm)
-    passed = rays.status == 0
+    for x, y in ((0.5, 0.5), *product(np.linspace(0.1, 0.9, _TRIED), repeat=2)):  # a mask may be dark in the middle
+        rays = camera.sample(film, np.tile(np.array([[x], [y]], np.float32), film.shape[1]), nm)
+        if (passed := rays.status == 0).any():
+            break
     if not passed.any():
         raise InputError(camera.name, "film", f"({width:g} x {height:g} mm)", "a film on which light arrives")
     widest = math.degrees(math.acos(float(np.clip((-rays.direction[2][passed]).min(), -1, 1))))

@@ -23,11 +23,13 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.graph.compiler import has_compiler
+from neurolens.optics.lens.apertures import Aperture
 from neurolens.optics.lens.shot import Shot
 from neurolens.pictures.defocus.kernels import kernel_at, kernels_over, own_plate, tint
 from neurolens.pictures.defocus.picture import (
     SAMPLES,
     _sizes,
+    check_field,
     defocus,
     gather,
     spread_highlights,
@@ -341,6 +343,25 @@ def test_a_point_on_the_axis_of_a_moved_film_has_the_disc_of_a_centred_one() -> 
         assert kernel.middle_px == pytest.approx(at, abs=0.01)
         found.append(kernel.light)
     np.testing.assert_allclose(found[1], found[0], atol=1e-3 * found[0].max())
+
+
+def test_discs_have_the_corners_of_a_stop_of_three_blades() -> None:
+    """Behind the focus a disc stands as the stop does: its first corner at 20 degrees, two thirds of a turn apart."""
+    model, sizes = str(ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"), list[float]()
+    for name in (model, "thin"):
+        camera = make_camera(name, Shot((24.0, 16.0), 2.0, 2.8, aperture=Aperture(3, 20.0)))
+        kernel = kernel_at(camera, own_plate(camera, (1200, 800)), (600.0, 400.0), 0.0, (600.0, 400.0))
+        assert kernel is not None
+        green = kernel.light[..., 1].astype(np.float64) / kernel.light[..., 1].sum()
+        y, x = np.mgrid[: green.shape[0], : green.shape[1]]
+        off = x - 1j * y - (green * (x - 1j * y)).sum()
+        corners = (green * off**3).sum()  # of a triangle
+        assert math.degrees(np.angle(corners)) / 3 == pytest.approx(20, abs=1)
+        sizes.append(abs(corners) ** (1 / 3))
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
+    ring = np.ones((64, 64))
+    ring[16:48, 16:48] = 0
+    check_field(make_camera("thin", Shot((24.0, 16.0), 2.0, 2.8, aperture=Aperture(mask=ring))))  # dark in the middle
 
 
 def test_a_moved_film_takes_the_highlights_at_its_edge() -> None:
