@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from shipped import tabled
@@ -15,7 +16,7 @@ from neurolens.optics.setting.states import set_lens
 INF = math.inf
 
 
-def library(name: str, **state: float) -> Scene:
+def library(name: str, **state: Any) -> Scene:
     """A lens of the library in a state, looking at what it is focused on."""
     return Scene(set_lens(tabled(name), **state), state.get("focus_m", INF))
 

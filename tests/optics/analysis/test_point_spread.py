@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from analysis_lenses import cartesian, grid, library
 from path_difference import diffraction_image
 from scipy.special import j1, jv
@@ -25,10 +26,11 @@ from neurolens.optics.analysis.diffraction import (
 )
 from neurolens.optics.analysis.exit_pupil import ExitPupil, _least, open_shares
 from neurolens.optics.analysis.field_curves import illumination
-from neurolens.optics.analysis.fields import Scene
+from neurolens.optics.analysis.fields import Scene, on_plane
 from neurolens.optics.analysis.psf import psf
 from neurolens.optics.analysis.spots import diffraction_mtf, working_f_number
 from neurolens.optics.lens.apertures import Aperture
+from neurolens.optics.trace.rays import Rays, trace
 
 ONE = np.ones((1, 1))
 
@@ -123,6 +125,22 @@ def test_the_image_is_the_sum_of_waves_over_exact_rays(f_number: float, field: f
     assert found.diffraction[0] == pytest.approx(direct, abs=0.02 * direct.max())
     assert found.strehl[0] == pytest.approx(direct.max(), abs=5e-3)
     assert pupil.blur_mm < half
+
+
+def test_aspheres_that_turn_rays_far_aside_beyond_their_rims_do_not_touch_the_wavefront() -> None:
+    """On the axis the Strehl ratio is an integral over a fan of rays: W is that of -x over the sine of their slope."""
+    given = library("fujifilm_fujinon_xf_16mm_f1_4_r_wr", focus_mode="best")
+    height = torch.linspace(0.0, given.lens.surfaces[0].semi_diameter_mm, 4001, dtype=torch.float64)
+    zero = torch.zeros_like(height)
+    out = trace(given.lens, Rays(height, zero, zero - 50, zero, zero, zero + 1), D, towards="film", transmittance=True)
+    met, lit = on_plane(out.rays, float(given.lens.film_z_mm or 0)), int((out.status == 0).sum())
+    assert out.transmittance is not None and bool((out.status[:lit] == 0).all())
+    x, sine, h, power = (c[1:lit].numpy() for c in (met.x, met.dx, height, out.transmittance))
+    path = -np.concatenate([[0.0], np.cumsum((x[1:] + x[:-1]) / 2 * np.diff(sine))])
+    field = np.sqrt(power * h * np.abs(np.gradient(sine) * sine) * np.gradient(h))  # of light per area of cosines
+    strehl = np.abs((field * np.exp(2j * np.pi * path / (D * 1e-6))).sum() / field.sum()) ** 2
+    assert line_through(pupil_of(given), np.linspace(-1e-3, 1e-3, 5)).max() == pytest.approx(strehl, abs=2e-3)
+    assert strehl > 0.09
 
 
 @pytest.mark.parametrize("lost", [0.0, 1e-9])
