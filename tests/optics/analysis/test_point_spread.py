@@ -276,6 +276,26 @@ def test_optiland_sums_huygens_wavelets_to_the_same_images(
         assert [image.max(), *widths] == pytest.approx(wanted, rel=0.035)
 
 
+# Optiland 0.6.3, without its grid: |mean of exp(2 pi i W) over the pupil|^2 by 15 rings of its `OPD` on the
+# axis, in focus, stopped down and out of focus. Lens, f-number, film z in mm, Strehl ratio.
+@pytest.mark.parametrize(
+    ("name", "f_number", "film_z_mm", "strehl"),
+    [
+        ("angenieux_double_gauss_100", 5.6, 182.5839, 0.91066),
+        ("canon_gauss_35", 8.0, 47.9526, 0.94432),
+        ("cooke_triplet_50", 11.0, 60.2270, 0.84035),
+    ],
+)
+def test_strehl_ratios_are_those_of_optilands_wavefronts(
+    name: str, f_number: float, film_z_mm: float, strehl: float
+) -> None:
+    lens = replace(library(name, f_number=f_number).lens, film_z_mm=film_z_mm)
+    [[[pupil]]] = pupils(Scene(lens, rims=False), [0.0], [546.074])
+    assert pupil is not None
+    field, line = cells_of(pupil, (128, 128)), np.linspace(-1e-3, 1e-3, 3)
+    assert irradiance(pupil, line, line, field)[1, 1] / perfect_peak(pupil, field) == pytest.approx(strehl, abs=1e-3)
+
+
 def _full_width(values: np.ndarray) -> float:
     """Width in samples of the peak at half its height, between which values are linear."""
     half, middle = values.max() / 2, int(values.argmax())
