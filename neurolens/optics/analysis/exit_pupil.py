@@ -166,7 +166,8 @@ def open_shares(pupils: Sequence[ExitPupil], cells: tuple[int, ...]) -> tuple[ND
         known = 0 * part
         for _ in range(_HALVINGS):
             part = part / 2
-            known += part * aperture.inside(*(begin[0] + (known + part) * way[0]), 1.0)
+            x, y = begin[0] + (known + part) * way[0]
+            known += part * aperture.inside(x, y, 1.0)
         part = known + part / 2
     given = np.concatenate([part, part * part, part * part * part], 1) @ _MOMENTS
     about = np.add.outer(np.arange(3) * wide, np.arange(3))
