@@ -42,7 +42,7 @@ _RAYS = 36  # rays along a side of the rectangle about what is lit
 _WIDER = 1.1  # the rectangle over what is lit
 # Cells along a side of the pupil: for each cycle of the field, besides for its edges, and at most.
 _PER_CYCLE, _FEWEST, FINEST = 2.0, 24, 400
-_RAYS_PER_PIXEL, _FEWEST_RAYS = 1.5, 12  # across the pupil, where rays are counted
+_RAYS_PER_PIXEL, _FEWEST_RAYS = 1.5, 16  # across the pupil, where rays are counted
 _AT_ONCE = 2**17  # cells whose waves are summed in one go
 _RINGS = 6  # radii of the Airy disc that a window has at least
 _MOST_CELLS = 512  # of the pupil along a side, whose rays are counted
