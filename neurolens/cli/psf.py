@@ -117,6 +117,8 @@ examples:
         write = self._writer()
         if self.side is not None and self.side % 2 == 0:
             self.refuse("--side", self.side, "an odd number of pixels")
+        if self.wavelengths and self.channels != "rgb":
+            self.refuse("--channels", self.channels, "none beside --wavelengths, which are channels of their own")
         began, shot = time.process_time(), self.state.shot()
         loaded = load_model(self.file) if is_model(self.file) else None
         model, tabled = (loaded.fitted, loaded.fitted.lens) if loaded else (None, read_any(self.file))

@@ -148,6 +148,7 @@ def test_dark_places_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[s
     [
         (("--pixel-um", "0"), "--pixel-um"), (("--f-number", "2,x"), "expected f-numbers"),
         (("--side", "8"), "an odd number"),
+        (("--channels", "mono", "--wavelengths", "550"), "none beside --wavelengths"),
         (("--distance", "-1"), "a distance in metres above 0"), (("--grid", "0x3"), "COLUMNSxROWS"),
         (("-o", "a.safetensors"), ".npz or .exr"), (("--wavelengths", "5"), "wavelengths in nm"),
         (("--focus", "0.01"), "focus"), (("--distance", "2,0.07"), "the front of the lens"),
