@@ -24,6 +24,7 @@ from neurolens.base.files import (
     atomic_write_text,
     check_writable,
     place_inside,
+    read_arrays,
     read_kept,
     safe_name,
     write_arrays,
@@ -478,6 +479,14 @@ def test_time_left_follows_the_pace_of_the_stage_and_the_plan_of_the_rest() -> N
         clock.now += 6
         report(0.25)
     assert stream.getvalue().splitlines()[0] == "trace:  25%, 6.0 s, 18 s left (in all 1 min 18 s left)"
+
+
+def test_arrays_are_read_as_they_were_in_whatever_order_they_lay_in_memory(tmp_path: Path) -> None:
+    array = np.arange(6.0).reshape(2, 3)
+    write_arrays(tmp_path / "a", {}, {"c": array, "f": np.asfortranarray(array), "t": array.T})
+    with read_arrays(tmp_path / "a") as (_, read):
+        for name, expected in {"c": array, "f": array, "t": array.T}.items():
+            assert np.array_equal(read(name), expected) and np.array_equal(read(name, mapped=True), expected)
 
 
 def test_a_kept_state_with_an_integer_beyond_floats_is_none(tmp_path: Path) -> None:

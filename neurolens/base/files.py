@@ -432,7 +432,9 @@ def write_arrays(
 def read_arrays(path: Path, names: Iterable[str] = ()) -> Iterator[tuple[Any, Callable[..., NDArray[Any]]]]:
     """Open a file of saved arrays: yield its `about`, and a function that reads an array by its name.
 
-    With `into` the function reads only an array of that shape and type; it fills that array and returns it.
+    With `into` the function reads only an array of that shape and type; it fills that array and returns it. With
+    `mapped` it returns an array as np.memmap, which reads from the file what is used. It has read the array once, part
+    by part, for its checksum and to find numbers that are not finite.
 
     Args:
         names: the arrays that the file must hold; none accepts any.
@@ -448,7 +450,12 @@ def read_arrays(path: Path, names: Iterable[str] = ()) -> Iterator[tuple[Any, Ca
             if not stored or (names and sorted(members) != sorted([_ABOUT, *(f"{name}.npy" for name in names)])):
                 raise ValueError("other contents")
             _check_length(path, members[_ABOUT].file_size)
-            yield json.loads(archive.read(_ABOUT)), lambda name, into=None: _read(archive, members[f"{name}.npy"], into)
+            yield (
+                json.loads(archive.read(_ABOUT)),
+                lambda name, into=None, mapped=False: _read(
+                    archive, members[f"{name}.npy"], into, file if mapped else None
+                ),
+            )
     except OSError as error:
         if error.filename is not None:
             raise
@@ -503,16 +510,33 @@ def _header(array: NDArray[Any]) -> bytes:
     from numpy.lib import format as numpy_format
 
     out = io.BytesIO()
-    numpy_format.write_array_header_1_0(out, numpy_format.header_data_from_array_1_0(array))
+    # Written row by row, in whatever order the array lies in memory.
+    numpy_format.write_array_header_1_0(out, numpy_format.header_data_from_array_1_0(array) | {"fortran_order": False})
     return out.getvalue()
 
 
-def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, into: NDArray[Any] | None) -> NDArray[Any]:
+def _read(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, into: NDArray[Any] | None, mapped: BufferedReader | None
+) -> NDArray[Any]:
     if into is None:
-        from numpy.lib import format as numpy_format
+        import numpy as np
 
         with archive.open(info) as member:
-            return numpy_format.read_array(member, allow_pickle=False)
+            if mapped is None:
+                return np.lib.format.read_array(member, allow_pickle=False)
+            # Before a member's content come 30 bytes, whose last four are the lengths of its name and of more fields,
+            # and then these.
+            start = mapped.seek(info.header_offset + 26) + 4 + sum(np.frombuffer(mapped.read(4), "<u2").tolist())
+            np.lib.format.read_magic(member)
+            (shape, by_columns, kind), head = np.lib.format.read_array_header_1_0(member), member.tell()
+            array = np.memmap(mapped, kind, "r", start + head, shape, "CF"[by_columns])  # type: ignore[call-overload]
+            parts = iter(lambda: member.read(CHUNK_BYTES), b"")  # the last compares the checksum
+            if (
+                not all(np.isfinite(np.frombuffer(part, kind)).all() for part in parts)
+                or member.tell() != head + array.nbytes
+            ):
+                raise ValueError(f"{info.filename} has numbers that are not finite, or not as many as its header says")
+            return array
     header = _header(into)
     if info.file_size != len(header) + into.nbytes:
         raise ValueError(f"{info.filename} of {info.file_size} bytes")

@@ -166,9 +166,8 @@ def _over_axes(value: Any) -> dict[str, Rows]:
             each, keys[axes[0]] = {"": list(item.values())}, list(item)
         columns |= {f"{name}.{k}" if k else name: (axes or own[k], np.asarray(v)) for k, v in each.items()}
     found: dict[str, Rows] = {}
-    for axes in dict.fromkeys(axes for axes, _ in columns.values()):
-        if any(set(axes) < set(others) for others, _ in columns.values()):
-            continue
+    every = dict.fromkeys(axes for axes, _ in columns.values())
+    for axes in [axes for axes in every if not any(set(axes) < set(others) for others in every)]:
         inside = {k: (a, v) for k, (a, v) in columns.items() if set(a) <= set(axes)}
         sides = {axis: max(v.shape[a.index(axis)] for a, v in inside.values() if axis in a) for axis in axes}
         marks = {

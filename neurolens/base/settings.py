@@ -472,9 +472,7 @@ def _with_new_names(
 ) -> Mapping[str, Any]:
     """Return the data with keys that were renamed (the field's metadata `was`) under their new names."""
     for name, f in known.items():
-        for old in f.metadata.get("was", ()):
-            if old not in data:
-                continue
+        for old in [old for old in f.metadata.get("was", ()) if old in data]:
             values = [data[key] for key in (name, old) if data.get(key, "none") != "none"]
             if len(values) > 1:
                 raise InputError(file, _join(prefix, old), data[old], f"left out beside {name}, its new name")
@@ -548,10 +546,8 @@ def _convert_union(value: Any, kinds: tuple[Any, ...], file: str | Path, place: 
     if len(inner) == 1:
         return _convert(value, inner[0], file, place)  # keeps the precise message of a nested table
     for kind in inner:
-        try:
+        with suppress(InputError):
             return _convert(value, kind, file, place)
-        except InputError:
-            continue
     raise InputError(file, place, value, " or ".join(_describe(kind) for kind in kinds))
 
 

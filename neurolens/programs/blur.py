@@ -8,6 +8,7 @@ has a share of.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -50,22 +51,20 @@ class Blur:
             raise InputError("blur", "state", state, f"below {arrays['psf'].shape[:2]}, the file's states")
         if not all(2 * abs(place) <= side for place, side in zip(at_mm, about["film_mm"], strict=True)):
             raise InputError("blur", "at_mm", at_mm, "a place on the film of {:g} x {:g} mm".format(*about["film_mm"]))
-        kernels, pixel_mm = arrays["psf"][state].astype(np.float64), about["pixel_um"] / 1000
-        self.size, self.channels, self.radius = size, kernels.shape[2], kernels.shape[-1] // 2
-        whole = kernels.sum((-2, -1), keepdims=True)
-        kernels /= np.where(whole > 0, whole, 1)
-        if vignetting:
-            kernels *= arrays["light"][state][..., None, None, None]
+        psf, light, pixel_mm = arrays["psf"][state], arrays["light"][state], about["pixel_um"] / 1000
+        self.size, self.channels, self.radius = size, psf.shape[2], psf.shape[-1] // 2
         height, width = size
         up = at_mm[1] + ((height - 1) / 2 - np.arange(height)) * pixel_mm
         right = at_mm[0] + (np.arange(width) - (width - 1) / 2) * pixel_mm
         rows = shares(-arrays["place_mm"][:, 0, 1], -up)
-        columns = list(shares(arrays["place_mm"][0, :, 0], right))
-        self._parts = [
-            (*down, *across, torch.from_numpy(part[:, None] * other), torch.from_numpy(kernels[i, j]))
-            for i, down, part in rows
-            for j, across, other in columns
-        ]
+        columns = shares(arrays["place_mm"][0, :, 0], right)
+        self._parts = []
+        for (i, down, part), (j, across, other) in product(rows, columns):
+            kernel = np.array(psf[i, j], np.float64)
+            whole = kernel.sum((-2, -1), keepdims=True)
+            kernel /= np.where(whole > 0, whole, 1)
+            kernel *= light[i, j] if vignetting else 1
+            self._parts.append((*down, *across, torch.from_numpy(part[:, None] * other), torch.from_numpy(kernel)))
 
     def __call__(self, sharp: Tensor) -> Tensor:
         """Return the blurred picture."""
@@ -106,6 +105,8 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
     A pair is determined by its number and the seed. Patches are [3, n, n] of linear sRGB. With a sensor the second has
     its noise and its colours: [3, n, n], or [1, n, n] of a mosaic, as light (electrons over those of value 1).
 
+    Files are read once for their checksums, and a pair reads again what it needs: they may be larger than memory.
+
     Attributes:
         pictures: files (.exr, or .png and .jpg as sRGB) or arrays [H, W, 3] of linear sRGB, floats whose white is 1.
         files: of `neurolens psf` with channels R, G, B.
@@ -113,7 +114,8 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
         vignetting: as of `Blur`.
 
     Raises:
-        InputError: there is no picture or file, or a picture is none of these, or smaller than a patch.
+        InputError: there is no picture or file, or a picture is none of these, or smaller than a patch; a file is
+            damaged, or has changed since.
         IndexError: the number of a pair is not below the length.
     """
 
@@ -132,10 +134,14 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
         for name, least in (("patch", 1), ("seed", 0), ("length", 1)):
             if (number := getattr(self, name)) is not None and (number != int(number) or number < least):
                 raise InputError("pairs", name, number, f"a whole number, at least {least}")
-        self._lenses = [read_psf(Path(file)) for file in self.files]
-        for file, (_, arrays) in zip(self.files, self._lenses, strict=True):
-            if arrays["psf"].shape[4] != 3:
-                raise InputError(file, "channels", arrays["psf"].shape[4], "three channels, R, G and B")
+        self._lenses: list[tuple[dict[str, Any], Arrays, Path, int, Any]] = []
+        for file in [Path(file).absolute() for file in self.files]:
+            about, arrays = read_psf(file)
+            if (psf := arrays.pop("psf")).shape[4] != 3:
+                raise InputError(file, "channels", psf.shape[4], "three channels, R, G and B")
+            # What goes to a worker is where the point spread lies in its file, not the point spread.
+            mapping = psf.dtype, "r", psf.offset, psf.shape, "FC"[psf.flags.c_contiguous]  # type: ignore[attr-defined]
+            self._lenses.append((about, arrays, file, file.stat().st_mtime_ns, mapping))
 
     def __len__(self) -> int:
         return self.length or len(self.pictures)
@@ -154,7 +160,10 @@ class BlurredPairs(Dataset[tuple[Tensor, Tensor]]):
             raise InputError("pairs", "picture", f"({picture.dtype} {picture.shape})", expected)
         if min(picture.shape[:2]) < self.patch:
             raise InputError("pairs", "picture", picture.shape, f"at least {self.patch} pixels a side")
-        about, arrays = self._lenses[random.integers(len(self._lenses))]
+        about, arrays, file, written, mapping = self._lenses[random.integers(len(self._lenses))]
+        if file.stat().st_mtime_ns != written:
+            raise InputError(file, "file", "(changed since)", "the file that it was at first")
+        arrays = arrays | {"psf": np.memmap(file, *mapping)}
         n, d = (int(random.integers(count)) for count in arrays["psf"].shape[:2])
         free_mm = np.maximum(np.array(about["film_mm"]) - self.patch * about["pixel_um"] / 1000, 0)
         right, up = (free_mm * (random.random(2) - 0.5)).tolist()

@@ -134,14 +134,14 @@ def library_of(
 
 
 def read_psf(path: Path) -> tuple[dict[str, Any], Arrays]:
-    """Read a file of point spread: its `about.json`, and its arrays.
+    """Read a file of point spread: its `about.json`, and its arrays; `psf` stays in the file and is mapped.
 
     Raises:
-        InputError: it is no such file.
+        InputError: it is missing or no such file, or `psf` is not finite.
     """
     try:
         with read_arrays(path, _NAMES) as (about, read):
-            arrays, about = {name: read(name) for name in _NAMES}, dict(about)
+            arrays, about = {name: read(name, mapped=name == "psf") for name in _NAMES}, dict(about)
         sizes = (zip(axes, arrays[name].shape, strict=True) for name, axes in _ARRAYS.items())
         if (
             len(known := {("2", 2), *(one for some in sizes for one in some)}) > len(dict(known))
@@ -149,8 +149,9 @@ def read_psf(path: Path) -> tuple[dict[str, Any], Arrays]:
         ):
             raise ValueError("shapes that do not fit each other, or about.json without film_mm and pixel_um")
         return about, arrays
-    except ValueError as error:
-        raise InputError(path, "file", f"({error})", "a file of neurolens psf (.npz)") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(path, "file", f"({reason})", "a file of neurolens psf (.npz)") from None
 
 
 def channels_of_exr(arrays: Arrays, names: Sequence[str]) -> Arrays:

@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import pickle
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -282,6 +285,55 @@ def test_what_gives_no_pairs_is_one_line(made: Path, wrong: dict[str, Any], said
     given: dict[str, Any] = {"pictures": [np.zeros((40, 40, 3))], "files": [made], "patch": 32}
     with pytest.raises(InputError, match=said):
         BlurredPairs(**(given | wrong))[0]
+
+
+def test_point_spread_stays_in_its_file(made: Path, tmp_path: Path) -> None:
+    """Other processes get its place in the file, from where they make the very same pairs."""
+    with np.load(made) as file:
+        arrays = {name: file[name] for name in p.read_psf(made)[1]}
+    about, mapped = p.read_psf(made)
+    assert isinstance(mapped["psf"], np.memmap) and np.array_equal(mapped["psf"], arrays["psf"])
+    x = noise(3, 50, 60)
+    assert torch.equal(Blur(made, (50, 60), (7.0, 2.0))(x), Blur((about, arrays), (50, 60), (7.0, 2.0))(x))
+    by_columns = tmp_path / "f.npz"
+    np.savez(by_columns, **(arrays | {"psf": np.asfortranarray(arrays["psf"])}))
+    with zipfile.ZipFile(by_columns, "a") as archive:
+        archive.writestr("about.json", json.dumps(about))
+    pairs, other = (BlurredPairs([noise(60, 60, 3).numpy()], [file], 16, length=9) for file in (made, by_columns))
+    sent = pickle.dumps(pairs)
+    assert len(sent) < arrays["psf"].nbytes / 4
+    for one, same, third in zip(pairs, pickle.loads(sent), other, strict=True):  # noqa: S301
+        assert torch.equal(one[1], same[1]) and torch.equal(one[1], third[1])
+
+
+def test_damaged_missing_and_changed_files_are_told(made: Path, tmp_path: Path) -> None:
+    (about, arrays), picture, file = p.read_psf(made), np.zeros((40, 40, 3)), tmp_path / "a.npz"
+    with pytest.raises(InputError, match=r"a\.npz: file: got \(No such file"):
+        BlurredPairs([picture], [made, file], 16)
+    data = bytearray(made.read_bytes())
+    at = data.index(arrays["psf"][1, 1, 1, 1, 1].tobytes())
+    data[at] ^= 1  # the last bit of a number
+    file.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.npz.*Bad CRC-32.*psf"):
+        BlurredPairs([picture], [file], 16)
+    for shape in (b"(2, 2, 2, 3, 3, 41, 40)", b"(2, 2, 2, 3, 3, 41, 42)"):  # less and more than there is
+        with zipfile.ZipFile(made) as old, zipfile.ZipFile(file, "w") as new:
+            new.comment = bytes(60000)  # so that the file is long enough
+            for name in old.namelist():
+                new.writestr(name, old.read(name).replace(b"(2, 2, 2, 3, 3, 41, 41)", shape))
+        with pytest.raises(InputError, match=r"psf\.npy has .* not as many as its header says"):
+            BlurredPairs([picture], [file], 16)
+    psf = np.array(arrays["psf"])
+    psf[1, 1, 1, 1, 1, 3, 3] = np.nan
+    write_arrays(file, about, arrays | {"psf": psf})
+    with pytest.raises(InputError, match=r"a\.npz.*psf.*not finite"):
+        BlurredPairs([picture], [file], 16)
+    write_arrays(file, about, arrays)
+    pairs = BlurredPairs([picture], [file], 16)
+    assert pairs[0][1].isfinite().all()
+    os.utime(file, ns=(1, 1))
+    with pytest.raises(InputError, match=r"a\.npz.*changed since"):
+        pairs[0]
 
 
 def test_a_loop_over_pairs_ends_and_takes_tensors(made: Path) -> None:
