@@ -16,6 +16,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.report import PART, Report, some_of
 from neurolens.base.settings import setting, setting_of
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.field import on_axis
 from neurolens.cli import arguments as cli
 from neurolens.cli.stmap import Maker, Maps, Projection, StMap, TracedFrame, one_centre
 from neurolens.optics.lens.shot import POSES
@@ -109,6 +110,11 @@ class _Writer:
     fits: dict[str, standards.FittedProjection] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def posed(self) -> list[str]:
+        """Return the settings by which the film of any frame is turned or moved."""
+        return sorted({name for f in self.frames for name in POSES if f.camera.settings.get(name)})
+
     def files(self, found: Maps, progress: Progress) -> list[str]:
         """Write all files and return their names."""
         names, command, shot = [], self.command, self.shot
@@ -146,15 +152,15 @@ class _Writer:
     def _of_frame(self, k: int) -> list[str]:
         """Write the OpenTrackIO sample and the projections of a frame; return their names."""
         command, pinhole, traced = self.command, self.shot.frames[k], self.frames[k].fields[""]
-        text, left_px, share = standards.opentrackio_sample(traced, pinhole, self.shot)
+        text, left_px, share = standards.opentrackio_sample(traced, pinhole, self.shot, bool(self.posed))
         atomic_write_text(path := command.out / f"shot.opentrackio{pinhole.name}.json", text)
         self._worse("opentrackio_px", left_px)
         self._worse("light_share", share)
-        names = [str(path)]
+        names, axis = [str(path)], complex(on_axis(self.frames[k].camera)[0])
         for kind in _KINDS:
             try:
                 fitted, _, told = standards.fitted_projection(
-                    kind, traced, command.picture, command.film, self.shot.about
+                    kind, traced, command.picture, command.film, self.shot.about, axis
                 )
             except InputError as error:
                 note = f"shot.{kind}: got {error.value}, expected {error.expected}"
@@ -182,14 +188,14 @@ class _Writer:
             self.left[name] = max(value, self.left.get(name, 0.0))
 
     def _entries(self, progress: Progress) -> list[standards.LensfunEntry]:
-        """Return the entries of lensfun's profile, by focal length; none for a lens with cylinders."""
+        """Return the entries of lensfun's profile, by focal length; none for a moved film or a lens with cylinders."""
+        if self.posed:
+            told, pinholes = ", ".join(self.posed), "the pinholes of USD, Nuke, Blender and OpenTrackIO"
+            self.notes.append(f"shot.lensfun.xml: lensfun knows no film that is turned or moved ({told})")
+            self.notes.append(f"{told}: {pinholes} have none; the maps hold them")
+            return []
         if self.shot.frames[0].squeeze != 1:
             self.notes.append("shot.lensfun.xml: lensfun knows no anamorphic lens")
-            return []
-        if posed := sorted({name for f in self.frames for name in POSES if f.camera.settings.get(name)}):
-            told = ", ".join(posed)
-            self.notes.append(f"shot.lensfun.xml: lensfun knows no film that is turned or moved ({told})")
-            self.notes.append(f"{told}: the pinholes of USD, Nuke and Blender have none; the maps hold them")
             return []
         command, states, found = self.command, self.command.states(), list[Any]()
         by_focal = dict(sorted((float(f"{p.focal_mm:.5g}"), k) for k, p in enumerate(self.shot.frames)))

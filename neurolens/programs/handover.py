@@ -211,13 +211,18 @@ def exit_residual_px(field: Field, plates: Plates, planes: Mapping[str, FloatArr
 # Undistorted places are e (1 + k1 r^2 + k3 r^4 + k5 r^6) / (1 + k2 r^2 + k4 r^4 + k6 r^6), with e the places of the
 # lens's picture (the list "radial" of "Brown-Conrady D-U"; "U-D" is the other way), for a pinhole in the entrance
 # pupil. Light is 1 - (a1 r^2 + a2 r^4 + a3 r^6). A template has the rest of a sample. Not in it are: where the camera
-# stands, which its tracker knows; a focus at infinity; lateral colour; distortion of lenses with cylinders, or beyond
-# what a plane holds.
+# stands, which its tracker knows; a focus at infinity; lateral colour; distortion of lenses with cylinders, beyond
+# what a plane holds, or on a film that is turned or moved.
 
 
-def opentrackio_sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | None, float]:
-    """Return one frame's sample as JSON, and the worst that its formulae leave: pixels (or None), share of light."""
-    plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1
+def opentrackio_sample(
+    field: Field, pinhole: Pinhole, shot: Handed, moved: bool = False
+) -> tuple[str, float | None, float]:
+    """Return one frame's sample as JSON, and the worst that its formulae leave: pixels (or None), share of light.
+
+    `moved`: whether the film is turned or moved.
+    """
+    plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1 and not moved
     distortion, left_px = _distortions(field, shot) if plane else ([], None)
     points = lit_points(field, shot.film_mm(shot.plates.picture, squeezed=True))
     light, share = falloff(field.relative_light(points), np.abs(points))
@@ -236,18 +241,19 @@ def opentrackio_sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[st
 
 
 def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float]]], float]:
-    """Fit a round lens's distortion both ways: names with coefficients, and the worst that they leave in pixels."""
-    points = film_points(field, shot.film_mm(shot.plates.picture), 257)
+    """Fit a lens's distortion both ways: names with coefficients, and the worst that they leave in pixels."""
+    points = _tried_points(field, shot)
     way = field.directions(points)
-    both, found, worst = (points.real, field.frame.reach_mm[0] * way[0] / way[2]), [], 0.0
+    both, found, worst = (points, field.frame.reach_mm[0] * (way[0] + 1j * way[1]) / way[2]), [], 0.0
     for model, (start, goal) in zip(MODELS, (both, both[::-1]), strict=True):
-        powers = np.stack([(start / start[-1]) ** n for n in (2, 4, 6)])
-        ratio, fits = goal / start, []
-        for terms in (powers, np.concatenate([powers, -ratio * powers])):
+        radius, along = _along_radius(start, goal)
+        widest, fits = radius.max(), []
+        powers = np.stack([(radius / widest) ** n for n in (2, 4, 6)])
+        for terms in (radius * powers, np.concatenate([radius * powers, -along * powers])):
             k = np.zeros(6)
-            k[: len(terms)] = np.linalg.lstsq((start * terms).T, goal - start, rcond=_LEAST)[0]
-            missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) - ratio) * start
-            by_mm = k.reshape(2, 3) / start[-1] ** np.array([2, 4, 6])
+            k[: len(terms)] = np.linalg.lstsq(terms.T, along - radius, rcond=_LEAST)[0]
+            missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) * start - goal)
+            by_mm = k.reshape(2, 3) / widest ** np.array([2, 4, 6])
             # The last place is 1, the widest.
             pole = projections.has_pole(k[3:].tolist(), 1.0)
             fits.append((math.inf if pole else float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
@@ -257,6 +263,24 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
         found.append((model, radial.T.reshape(-1).tolist()))
         worst = max(worst, left)
     return found, worst
+
+
+def _tried_points(field: Field, shot: Handed) -> Complex:
+    """Return points to which formulae of the radius are fitted: on one radius, or over the picture if it is not round.
+
+    A copy of a lens, whose elements are decentred, has no such formula: its picture tells what one leaves.
+    """
+    film_mm = shot.film_mm(shot.plates.picture)
+    if field.round:
+        return film_points(field, film_mm, 257)
+    points = lit_points(field, film_mm)
+    return points[field.relative_light(points) >= DIM]  # the field traces no places beyond these
+
+
+def _along_radius(start: Complex, goal: Complex) -> tuple[Array, Array]:
+    """Return the distances of places from the centre, and how far out along their radius their goals lie."""
+    radius = np.abs(start)
+    return radius, (goal * start.conj()).real / np.where(radius > 0, radius, 1.0)
 
 
 # A lensfun profile: distortion as poly5, lateral colour as poly3, light as pa, by focal length and aperture.
@@ -298,18 +322,18 @@ class LensfunEntry(NamedTuple):
 def lensfun_entry(
     field: Field, camera: Camera, plane_m: float, shot: Handed, red_blue_nm: tuple[float, float], at_stop: AtStop
 ) -> LensfunEntry:
-    """Make the entry of one state of a round lens; `at_stop` makes its camera at an f-number (None: the widest)."""
+    """Make the entry of one state of a lens; `at_stop` makes its camera at an f-number (None: the widest)."""
     picture, pixel = shot.plates.picture, shot.plates.pixel_mm[0]
     film_mm = shot.film_mm(picture)
     corner = math.hypot(picture[0] - 1, picture[1] - 1) / 2 * pixel
     unit = corner / math.hypot(1, max(film_mm) / min(film_mm))
-    points = film_points(field, film_mm, 257)
-    (size, a, b), left = _minimax(field.ideal(points).real / unit, points.real / unit, (1, 3, 5))
+    points = _tried_points(field, shot)
+    (size, a, b), left = _minimax(field.ideal(points) / unit, points / unit, (1, 3, 5))
     colours = []
     for nm in red_blue_nm:
         light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, plane_m)
         # From where the mean colour shows what this colour shows.
-        colours.append(_minimax(field.picture(light.place).real / unit, points.real / unit, (1, 2, 3)))
+        colours.append(_minimax(field.picture(light.place) / unit, points / unit, (1, 2, 3)))
     lights, share = _lights(field, camera, plane_m, points[3::4], corner, at_stop)
     focal, px = field.frame.reach_mm[0], unit / pixel
     return LensfunEntry(
@@ -318,14 +342,16 @@ def lensfun_entry(
     )  # fmt: skip
 
 
-def _minimax(x: Array, y: Array, powers: Sequence[int]) -> tuple[tuple[float, ...], float]:
-    """Fit a polynomial with the least worst distance from y, by Lawson's weights; also return that distance."""
-    rows, weight = np.stack([x**p for p in powers], 1), np.ones(x.size)
+def _minimax(start: Complex, goal: Complex, powers: Sequence[int]) -> tuple[tuple[float, ...], float]:
+    """Fit a polynomial of the radius with the least worst distance from goals, by Lawson's weights; also return it."""
+    radius, along = _along_radius(start, goal)
+    rows, weight = np.stack([radius**p for p in powers], 1), np.ones(radius.size)
+    turn = start / np.where(radius > 0, radius, 1.0)
     best, least = tuple[float, ...](), math.inf
     for _ in range(_ROUNDS):
         root = np.sqrt(weight)
-        found = np.linalg.lstsq(rows * root[:, None], y * root, rcond=None)[0]
-        left = np.abs(rows @ found - y)
+        found = np.linalg.lstsq(rows * root[:, None], along * root, rcond=None)[0]
+        left = np.abs(rows @ found * turn - goal)
         if left.max() < least:
             best, least = tuple(found.tolist()), float(left.max())
         weight = weight * left + 1e-12
@@ -342,7 +368,7 @@ def _lights(
     rows, worst, points = {}, 0.0, np.append(0j, points)
     for made in (at_stop(None), *map(at_stop, further), camera):
         light = traced_light(made, points, field.spectrum, field.frame, field.target, plane_m).light
-        k, left = falloff(light[1:] / light[0], points.real[1:] / corner)
+        k, left = falloff(light[1:] / light[0], np.abs(points[1:]) / corner)
         f_number = float(made.settings["lens_state"]["f_number"])
         rows[f"{f_number:.3g}"] = (f_number, *k)
         worst = max(worst, left)

@@ -600,6 +600,37 @@ def test_what_a_standard_cannot_say_is_one_line(
     )
 
 
+def test_a_moved_film_is_told_of_or_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV's numbers have the axis where the film has it; formulae of the radius about the picture's centre fail."""
+    monkeypatch.setattr(fields, "_OTHER", (25, 16))
+    monkeypatch.setattr(files, "SIDE", 65)
+    words = (GAUSS, "--film", "24x16", "--width", "96", "--film-shift", "3", "--quiet", "-o", tmp_path / "a")
+    told = run_json(capsys, "handover", *words)
+    opencv = json.loads((tmp_path / "a" / "shot.opencv.json").read_text())
+    assert (opencv["cx"], opencv["cy"]) == (48 - 3 / 24 * 96, 32) and told["projections"]["opencv"]["worst_px"] < 0.05
+    sample = json.loads((tmp_path / "a" / "shot.opentrackio.json").read_text())
+    assert "distortion" not in sample["lens"] and "opentrackio_px" not in told["left"]
+    assert sum("film_shift_mm" in note for note in told["not_written"]) == 2
+
+
+def test_what_formulae_leave_of_a_copy_is_that_of_the_whole_picture() -> None:
+    """A copy whose picture is decentred, which no formula of the radius can say, is off by that at least."""
+    camera = make_camera("thin", Shot(film_mm=(20.0, 16.0), focus_m=3.0, focal_length_mm=42.0))
+    field, off = field_of(camera, 3.0), 0.01 + 0.02j
+    shifted = [replace(polar, shift=sign * off) for sign, polar in ((1, field.ideal), (-1, field.picture))]
+    field = replace(field, ideal=shifted[0], picture=shifted[1], light=field.light.repeat(4, 1))
+    plates = plates_of([field], (600, 480), (20.0, 16.0))
+    pinhole = Pinhole.of("", field, camera.settings, 3.0)
+    shot = Handed({"cameraModel": "thin"}, "0", (24, 1), (pinhole,), plates, ())
+    least = 0.999 * abs(off) / plates.pixel_mm[0]
+    _, left_px, _ = files.opentrackio_sample(field, pinhole, shot)
+    entry = files.lensfun_entry(field, camera, 3.0, shot, (611.4, 464.2), lambda f_number: camera)
+    assert left_px is not None and min(left_px, entry.distortion_px) > least
+    assert max(left_px, entry.distortion_px, entry.colour_px) < 2 * least
+
+
 def test_an_anamorphic_lens_has_its_squeeze_where_a_standard_knows_one() -> None:
     """The pinhole's film is as much wider, pixels have its ratio; what knows spherical lenses alone is left out."""
     camera = make_camera("thin", Shot(film_mm=(20.0, 16.0), focus_m=3.0, focal_length_mm=42.0))
