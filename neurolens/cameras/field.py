@@ -334,6 +334,10 @@ class Field:
             return np.asarray(np.abs(point) <= self.end_mm * (1 + 1e-9))
         return self.relative_light(point) > 0
 
+    def bright(self, point: Complex) -> NDArray[np.bool_]:
+        """Test whether the places of picture points are traced ones: beyond `DIM` they continue straight."""
+        return self.relative_light(point) >= DIM
+
     def relative_light(self, point: Complex) -> Array:
         """Return the light at picture points (as `lit`) over that on the axis; 0 beyond the end of the light."""
         value = np.maximum(on_rings(self.light, self.end_mm, point), 0.0)
@@ -407,6 +411,15 @@ def shown_at(camera: Any, field: Field, point: Complex, distance_m: float) -> Co
 def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
     """Return points along x, from next to the axis to the radius of the film's corner or the end of the light, mm."""
     return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.complex128)
+
+
+def radial_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
+    """Return points to which formulae of the radius are fitted: along x, or over all of a picture that is not round.
+
+    No such formula holds for a copy of a lens, whose elements are decentred: over the picture one sees what it leaves.
+    """
+    points = film_points(field, film_mm, count) if field.round else lit_points(field, film_mm)
+    return points if field.round else points[field.bright(points)]
 
 
 def diagonal_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:

@@ -88,9 +88,10 @@ examples:
         "computed whole for each tile", kind=_tile, metavar="I/N", title=_FARMS,
     )  # fmt: skip
     merge: bool = setting(
-        False, "put tiles together: the picture that one run gives, bit for bit, with its preview and metadata, whose "
-        "times are summed; of tiles of frames a picture a frame. Takes -o and --exposure alone, and no tile of other "
-        "settings, missing, doubled or unfinished", title=_FARMS,
+        False, "put tiles together: the picture that one run gives, bit for bit (with --diffraction within rounding, "
+        "after which a sensor's noise is another), with its preview and metadata, whose times are summed; of tiles of "
+        "frames a picture a frame. Takes -o and --exposure alone, and no tile of other settings, missing, doubled or "
+        "unfinished", title=_FARMS,
     )  # fmt: skip
     dask: str | None = cli.dask(_FARMS)
     checkpoint_every: float = setting(

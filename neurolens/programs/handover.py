@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.files import atomic_write_text
@@ -26,14 +25,13 @@ from neurolens.base.html import html
 from neurolens.base.report import OPTIONAL, plain
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.field import (
-    DIM,
     Array,
     Complex,
     Field,
     centroids_m,
     diagonal_points,
-    film_points,
     lit_points,
+    radial_points,
     spectrum_of,
     traced_light,
 )
@@ -242,18 +240,17 @@ def opentrackio_sample(
 
 def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float]]], float]:
     """Fit a lens's distortion both ways: names with coefficients, and the worst that they leave in pixels."""
-    points = _tried_points(field, shot)
+    points = radial_points(field, shot.film_mm(shot.plates.picture), 257)
     way = field.directions(points)
     both, found, worst = (points, field.frame.reach_mm[0] * (way[0] + 1j * way[1]) / way[2]), [], 0.0
     for model, (start, goal) in zip(MODELS, (both, both[::-1]), strict=True):
-        radius, along = _along_radius(start, goal)
-        widest, fits = radius.max(), []
-        powers = np.stack([(radius / widest) ** n for n in (2, 4, 6)])
+        radius, _, along = projections.along_radius(start, goal)
+        powers, fits = np.stack([(radius / radius.max()) ** n for n in (2, 4, 6)]), []
         for terms in (radius * powers, np.concatenate([radius * powers, -along * powers])):
             k = np.zeros(6)
             k[: len(terms)] = np.linalg.lstsq(terms.T, along - radius, rcond=_LEAST)[0]
             missed = np.abs((1 + k[:3] @ powers) / (1 + k[3:] @ powers) * start - goal)
-            by_mm = k.reshape(2, 3) / widest ** np.array([2, 4, 6])
+            by_mm = k.reshape(2, 3) / radius.max() ** np.array([2, 4, 6])
             # The last place is 1, the widest.
             pole = projections.has_pole(k[3:].tolist(), 1.0)
             fits.append((math.inf if pole else float(missed.max()) / shot.plates.pixel_mm[0], by_mm))
@@ -263,24 +260,6 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
         found.append((model, radial.T.reshape(-1).tolist()))
         worst = max(worst, left)
     return found, worst
-
-
-def _tried_points(field: Field, shot: Handed) -> Complex:
-    """Return points to which formulae of the radius are fitted: on one radius, or over the picture if it is not round.
-
-    A copy of a lens, whose elements are decentred, has no such formula: its picture tells what one leaves.
-    """
-    film_mm = shot.film_mm(shot.plates.picture)
-    if field.round:
-        return film_points(field, film_mm, 257)
-    points = lit_points(field, film_mm)
-    return points[field.relative_light(points) >= DIM]  # the field traces no places beyond these
-
-
-def _along_radius(start: Complex, goal: Complex) -> tuple[Array, Array]:
-    """Return the distances of places from the centre, and how far out along their radius their goals lie."""
-    radius = np.abs(start)
-    return radius, (goal * start.conj()).real / np.where(radius > 0, radius, 1.0)
 
 
 # A lensfun profile: distortion as poly5, lateral colour as poly3, light as pa, by focal length and aperture.
@@ -327,7 +306,7 @@ def lensfun_entry(
     film_mm = shot.film_mm(picture)
     corner = math.hypot(picture[0] - 1, picture[1] - 1) / 2 * pixel
     unit = corner / math.hypot(1, max(film_mm) / min(film_mm))
-    points = _tried_points(field, shot)
+    points = radial_points(field, film_mm, 257)
     (size, a, b), left = _minimax(field.ideal(points) / unit, points / unit, (1, 3, 5))
     colours = []
     for nm in red_blue_nm:
@@ -344,9 +323,8 @@ def lensfun_entry(
 
 def _minimax(start: Complex, goal: Complex, powers: Sequence[int]) -> tuple[tuple[float, ...], float]:
     """Fit a polynomial of the radius with the least worst distance from goals, by Lawson's weights; also return it."""
-    radius, along = _along_radius(start, goal)
+    radius, turn, along = projections.along_radius(start, goal)
     rows, weight = np.stack([radius**p for p in powers], 1), np.ones(radius.size)
-    turn = start / np.where(radius > 0, radius, 1.0)
     best, least = tuple[float, ...](), math.inf
     for _ in range(_ROUNDS):
         root = np.sqrt(weight)
@@ -442,7 +420,7 @@ def fitted_projection(
     ring = ring[(ring > 0) & (ring < fitted.widest_rad)]
     beside = field.point(np.stack([np.sin(ring), 0 * ring, np.cos(ring)]))
     points = np.concatenate([lit_points(field, film_mm, _HELD_OUT), diagonal_points(field, film_mm, _ALONG), beside])
-    points = points[field.relative_light(points) >= DIM]  # the field traces no places beyond these
+    points = points[field.bright(points)]
     left = projections.residual(fitted, *_shown(field, size, film_mm, points))
     told = FittedProjection(
         camera=source,
@@ -538,11 +516,8 @@ def ray_table(
     """
     pixel_mm = film_mm[0] / size[0], film_mm[1] / size[1]
 
-    def bright(point: Complex) -> NDArray[np.bool_]:
-        return field.lit(point) & (field.relative_light(point) >= DIM)
-
     tried = np.concatenate([lit_points(field, film_mm, _HELD_OUT), diagonal_points(field, film_mm, _HELD_OUT[0])])
-    tried = tried[bright(tried)]
+    tried = tried[field.bright(tried)]
     seen = {d: centroids_m(camera, field, tried, d) for d in dict.fromkeys((math.inf, focus_m, near_m))}
     pixel = _pixels(lit_points(field, film_mm, _LIT), size, film_mm)
     first = np.maximum(np.floor(pixel.min(0) - np.array(size) / _LIT), 0).astype(int)
@@ -554,7 +529,7 @@ def ray_table(
         sides = (np.linspace(a - 0.5, b + 0.5, 2 * n + 1) for a, b, n in zip(first, last, counts, strict=True))
         pixel = np.stack([c.reshape(-1) for c in np.meshgrid(*sides)], 1)
         x, y = ((pixel + 0.5) / size - 0.5).T * np.array(film_mm)[:, None]
-        lit = bright(point := x - 1j * y)
+        lit = field.bright(point := x - 1j * y)
         rays = sight(camera, field, point[lit], near_m)
         table = table.fitted(pixel[lit], rays, field.relative_light(point[lit]))
         at, way = (c.T for c in np.split(table(_pixels(tried, size, film_mm)) * (OPENCV * 2), 2, axis=1))

@@ -146,6 +146,13 @@ def roots(bottom: Sequence[float]) -> NDArray[np.complex128]:
     return np.asarray(np.roots([*reversed(bottom), 1.0]), np.complex128)
 
 
+def along_radius(start: Any, goal: Any) -> tuple[Array, Any, Array]:
+    """Return distances of places x + i y from the centre, the ways there, and how far out along these goals lie."""
+    radius = np.abs(start)
+    turn = start / np.where(radius > 0, radius, 1.0)
+    return radius, turn, (goal * turn.conj()).real
+
+
 def has_pole(bottom: Sequence[float], widest: float) -> bool:
     """Return whether 1 + k x + l x^2 + ... is zero for a real x from 0 to `widest`."""
     at = roots(bottom)
