@@ -128,14 +128,14 @@ def test_a_full_disk_keeps_what_it_can_and_says_what_is_lost(
     def said(writers: list[str], *more: object) -> str:
         with monkeypatch.context() as patch:
             for writer in writers:
-                patch.setattr(f"neurolens.pictures.render.{writer}", full)
+                patch.setattr(f"neurolens.pictures.{writer}", full)
             assert main([*map(str, (*common, *more))]) == 2
         assert np.all(read_exr(out)[0] == 7)
         first, _, why = capsys.readouterr().err.splitlines()[-1].partition("; ")
         assert first == f"neurolens: {out}: No space left on device"
         return why
 
-    picture, both = ["pictures.write_exr"], ["pictures.write_exr", "renderer.write_checkpoint"]
+    picture, both = ["frames.write_exr"], ["frames.write_exr", "render.renderer.write_checkpoint"]
     resumes, disk = f"the same command resumes from {part}", f"({part}: No space left on device)"
     lost = f"the render is lost, for the checkpoint cannot be written either {disk}"
     assert said(both, "--samples", 32) == lost

@@ -127,7 +127,7 @@ examples:
         elif self.whole_camera or not is_model(file):
             if self.to == "onnx" or not whole:
                 what = "(a whole camera)" if self.whole_camera else "(a lens file)"
-                self.refuse(str(file), what, "a model, beside --to onnx, --fix or --only; or none of these")
+                self.refuse(str(file), what, "a model, or source code (--to c, glsl ...) without --fix, --only")
             write = self._write_camera if self.whole_camera else self._write_lens
             size = {"--focal-length", "--field"} if self.state.given.zoom != RANGE else set()
             self._check_state(size | {"--zoom", "--coating"}, "focus and stop are arguments of the function")

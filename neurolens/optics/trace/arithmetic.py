@@ -86,6 +86,10 @@ class Arithmetic:
         """Return the smaller of two values."""
         return np.minimum(a, b)
 
+    def exp(self, value: Any) -> Any:
+        """Return the exponential function."""
+        return np.exp(value)
+
     def abs(self, value: Any) -> Any:
         """Return the absolute value."""
         return np.abs(value)
@@ -153,6 +157,9 @@ class Graphs(Arithmetic):
 
     def least(self, a: Value, b: Value) -> Value:
         return a.minimum(b)
+
+    def exp(self, value: Value) -> Value:
+        return value.exp()
 
     def abs(self, value: Value) -> Value:
         return value.abs()

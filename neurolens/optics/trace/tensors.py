@@ -79,6 +79,9 @@ class Tensors(Arithmetic):
     def least(self, a: Tensor, b: Tensor) -> Tensor:
         return torch.minimum(a, b)
 
+    def exp(self, value: Tensor) -> Tensor:
+        return value.exp()
+
     def abs(self, value: Tensor) -> Tensor:
         return value.abs()
 
