@@ -87,7 +87,7 @@ class Arithmetic:
         return np.minimum(a, b)
 
     def exp(self, value: Any) -> Any:
-        """Return the exponential function."""
+        """Return the exponential function, of arrays and tensors alone: no graph has it."""
         return np.exp(value)
 
     def abs(self, value: Any) -> Any:
@@ -157,9 +157,6 @@ class Graphs(Arithmetic):
 
     def least(self, a: Value, b: Value) -> Value:
         return a.minimum(b)
-
-    def exp(self, value: Value) -> Value:
-        return value.exp()
 
     def abs(self, value: Value) -> Value:
         return value.abs()
