@@ -79,7 +79,8 @@ def with_phase(model: LensModel, rays: FilmRays, most: int = MORE_TERMS) -> Lens
     """Return the model with the optical path as one more output, fitted to rays that its lens passes.
 
     The path has at most `TERMS` terms, or `most` where these leave more than `ENOUGH_WAVES` and less than one wave. A
-    network beside 120 terms, of 745 weights and a minute of training, left two to three times what 240 terms leave.
+    network beside 120 terms, of 745 weights and a minute of training, left two to three times as much of wide lenses.
+    It left less of a phone lens, whose path has cusps (0.011 waves for 0.023), and of an f/1 asphere (0.009 for 0.012).
 
     Raises:
         InputError: a lens with cylinders or ideal surfaces, or a first-order model.
