@@ -184,8 +184,9 @@ class LensCamera:
     def start(self, runtime: Runtime | None, progress: Progress | None = None) -> None:
         """Choose what runs the camera; None takes C where the machine has a compiler that takes it, else onnxruntime.
 
-        C that is not asked for is compiled when rays are: many cameras are made for their pupil alone, and pictures
-        take other programs than single rays. `progress` says where C is given up for onnxruntime.
+        Unless `runtime` asks for C, a program is compiled when the first rays need it. For many cameras are made for
+        their pupil alone, and pictures take other programs than single rays. `progress` says where C is given up for
+        onnxruntime.
 
         Raises:
             InputError: C is asked for, and there is no compiler, or it fails.

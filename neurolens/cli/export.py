@@ -48,9 +48,9 @@ class Export(cli.Reporting):
 
     The code has the model's domain guard, stop, rims, transmittance and status codes. A comment at the top holds the
     card; beside it stand constants, and the place of the film for a focus. For a model of a whole zoom (or of internal
-    focus) the state is an argument. A lens file gives the exact lens, in the zoom, size and coating asked for; --to
-    c-double keeps it within 1e-12 mm of the tracer. OSL is a camera of Blender's Cycles (4.5 and later), whose inputs
-    are stop, focus, blades, zoom and more.
+    focus) the state is an argument. A lens file gives the exact lens, with the zoom, size and coating of the options.
+    --to c-double keeps it within 1e-12 mm of the tracer. OSL is a camera of Blender's Cycles (4.5 and later), whose
+    inputs are stop, focus, blades, zoom and more.
 
     With --whole-camera the code is the camera for one focus and stop: it takes a film point and two random numbers, and
     gives a weighted ray. The pupil's outline is a table in the file, or data beside it for most shading languages.

@@ -190,9 +190,9 @@ class _Writer:
     def _entries(self, progress: Progress) -> list[standards.LensfunEntry]:
         """Return the entries of lensfun's profile, by focal length; none for a moved film or a lens with cylinders."""
         if self.posed:
-            told, pinholes = ", ".join(self.posed), "the pinholes of USD, Nuke, Blender and OpenTrackIO"
-            self.notes.append(f"shot.lensfun.xml: lensfun knows no film that is turned or moved ({told})")
-            self.notes.append(f"{told}: {pinholes} have none; the maps hold them")
+            moves = ", ".join(self.posed)
+            self.notes.append(f"shot.lensfun.xml: lensfun knows no film that is turned or moved ({moves})")
+            self.notes.append(f"USD, Nuke, Blender and OpenTrackIO get an upright pinhole; the ST maps hold {moves}")
             return []
         if self.shot.frames[0].squeeze != 1:
             self.notes.append("shot.lensfun.xml: lensfun knows no anamorphic lens")

@@ -215,7 +215,10 @@ def spread(pupils: Sequence[ExitPupil | None], weights: Array, pixel_mm: float, 
 
 
 def stretched(images: Array, moves: Array) -> Array:
-    """Return images [N, side, side] with at offsets from the middle what these have at `moves` [2, 2] times it."""
+    """Return images [N, side, side] stretched about their middle.
+
+    At an offset from it they have what the given images have at `moves` [2, 2] times that offset.
+    """
     middle = np.full(2, (images.shape[-1] - 1) / 2)
     return np.maximum([affine_transform(image, moves, middle - moves @ middle) for image in images], 0)
 

@@ -63,7 +63,8 @@ class ExitPupil:
         figures: [D, D, K] Chebyshev coefficients on that box: of the wavefront W in mm, of the light per area of
             cosines in mm^2 (for an irradiance of 1 at the lens), and of x, y in mm at each surface that may cut the
             beam.
-        limits_mm: radii of those surfaces; the stop is the first. Traced pupils have `_told` as the last.
+        limits_mm: radii of those surfaces. The stop is the first. The last of a traced pupil is no surface, but the
+            ellipse about its rays (`_ellipse_about`).
         aperture: the stop's shape.
         hits_mm: [2, N] where some of the rays meet the film, counted from the centre.
         box: the part of the disc across the light's direction that holds the rays, [2 (low, high), 2].
@@ -283,15 +284,18 @@ def fitted_pupil(
     at, power = rays.at[cut][..., near].reshape(2 * len(cut), -1), (rays.power * energy)[near]
     figures = _fitted(design, half, np.array([0 * power, power, *places[:, near], *at])[:, None])[0]
     figures[_I, _J, 0] = [0, *wave]
-    figures = np.concatenate([figures, _told(known)], -1)
+    figures = np.concatenate([figures, _ellipse_about(known)], -1)
     hits, box = rays.hits[:, through] - centre[:, None], np.zeros((2, 2)) if box is None else box
     return ExitPupil(wavelength_nm, centre, middle, half, figures, (*limits[cut], 1.0), aperture, hits, box)
 
 
-def _told(points: Array) -> Array:
-    """Return the series [D, D, 2] of x and y that keep within 1 in an ellipse about points [2, N] of the box.
+def _ellipse_about(points: Array) -> Array:
+    """Return the series [D, D, 2] of two coordinates, in which the smallest ellipse about points is the unit circle.
 
-    It is a rim of the pupil: beyond the rays that they were fitted to polynomials swing, and may let light pass.
+    It is a rim of the pupil. For polynomials swing beyond the rays that they were fitted to, and may let light pass.
+
+    Args:
+        points: [2, N] of the box.
     """
     share, found = np.full(points.shape[1], 1 / points.shape[1]), np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
     for _ in range(20):  # Titterington's way to the smallest ellipse: points far out come to weigh more

@@ -74,8 +74,8 @@ def require_mitsuba(variant: str | None = None) -> Any:
             for, scalar_spectral is taken.
 
     Raises:
-        NeurolensError: Mitsuba is not installed, or a variant was asked for whose compiler (LLVM, CUDA) is missing or
-            too old.
+        NeurolensError: Mitsuba is not installed, or the compiler that the variant needs (LLVM, CUDA) is missing or too
+            old.
         InputError: this Mitsuba does not have the variant, or the variant carries neither RGB nor plain spectra.
     """
     mi, dr = libraries()
