@@ -111,7 +111,8 @@ def library_of(
     for part in parts.values():
         with suppress(FileNotFoundError, ValueError), read_arrays(part) as (_, read):
             found[part] = {name: read(name) for name in _NAMES[:6]}
-    with progress.stage(f"point spread at {len(task.places_mm) - 1} places, {len(tasks)} states") as report:
+    said = f"{len(tasks)} state{'s' * (len(tasks) != 1)}"
+    with progress.stage(f"point spread at {len(task.places_mm) - 1} places, {said}") as report:
         for each, answer in run_each(executor, point_spread, [t for t in tasks if parts[id(t)] not in found]):
             if isinstance(answer, Failed):
                 raise NeurolensError(f"point spread at {each.distance_m:g} m: {answer.reason}; {how_to_resume(folder)}")

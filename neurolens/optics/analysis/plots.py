@@ -59,13 +59,19 @@ def drawing(path: str | Path, width_in: float, height_in: float, title: str = ""
     """
     with style():
         figure = new_figure(width_in, height_in)
+        heads = list[Any]()
         if title:
             room = "\n\n" + "\n" * subtitle.count("\n") if subtitle else ""  # lines that the layout keeps free
-            figure.suptitle(title + room, x=0.01, ha="left", fontsize=12, fontweight="bold")
-            figure.text(0.01, 1 - 0.36 / height_in, subtitle, ha="left", va="top", fontsize=9, color="#555b63")
+            heads = [
+                figure.suptitle(title + room, x=0.01, ha="left", fontsize=12, fontweight="bold"),
+                figure.text(0.01, 1 - 0.36 / height_in, subtitle, ha="left", va="top", fontsize=9, color="#555b63"),
+            ]
         yield figure
         for text in figure.findobj(lambda artist: hasattr(artist, "set_text")):
             text.set_text(without_controls(text.get_text()))  # a lens's name may hold anything, and SVG is XML
+        for text in heads:  # long names stay within the picture
+            wide = text.get_window_extent().width / figure.bbox.width
+            text.set_fontsize(text.get_fontsize() * min(1.0, 0.98 / max(wide, 1e-9)))
         with atomic_path(path) as temporary:
             figure.savefig(temporary, facecolor="white")
 
@@ -393,7 +399,8 @@ def plot_point_spread(arrays: Any, pixel_um: float, path: str | Path, title: str
     distance, number = float(arrays["distance_m"][0]), float(arrays["f_number"][0])
     focus = "infinity" if math.isinf(distance) else f"{distance:g} m"
     text = f"Point spread over the picture, f/{number:g}, object at {focus}; brightness as square root"
-    with drawing(path, 1.0 * columns + 0.4, 1.0 * rows + 1.0, title, text) as figure:
+    each_in = max(1.0, 4.8 / columns)
+    with drawing(path, each_in * columns + 0.4, each_in * rows + 1.0, title, text) as figure:
         grid = figure.subplots(rows, columns, squeeze=False)
         for i, j in np.ndindex(rows, columns):
             image = colours[i, j][:, part, part].transpose(1, 2, 0)
